@@ -1,0 +1,135 @@
+"""The callback that says how masks may move."""
+
+from __future__ import annotations
+
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_sparse.engine.plan import Plan
+from sb3_sparse.errors import ConfigError
+from sb3_sparse.policies.mixin import SparsePolicyMixin
+from sb3_sparse.topology import method_named
+
+DEFAULTS = {"update_interval": 1000, "drop_fraction": 0.5, "end": 0.8, "update_on": "step"}
+
+
+class SparsityCallback(BaseCallback):
+    """Moves the masks of a sparse policy while it trains, and logs how sparse it is.
+
+    Holds no state of its own: to resume, load the model and pass the same callback again. Without
+    it masks stay as they are, which is static sparse training.
+
+    Logged: ``sparsity/total``, ``sparsity/<network>``, ``sparsity/nnz``, ``sparsity/mask_updates``,
+    ``sparsity/mask_churn`` (share of the active connections exchanged or pruned by the last update)
+    and ``sparsity/drop_fraction``.
+
+    :param method: ``"static"``, ``"set"``, ``"rigl"``, ``"prune"`` or a registered one
+    :param update_interval: gradient steps of a network's own optimizer between two updates
+        (default 1000)
+    :param drop_fraction: share of a layer's connections exchanged at the first update; decays to 0
+        along a cosine (default 0.5)
+    :param begin: progress (environment steps done / planned) at which updates begin (default 0, 0.2
+        for ``"prune"``)
+    :param end: progress at which they end (default 0.8)
+    :param update_on: ``"step"``: at the gradient step that is due (default); ``"rollout"``: at the
+        start of the next rollout
+    :param verbose: as in SB3
+    :raises ConfigError: for an unknown method, a value that is not allowed or an argument that means
+        nothing for the method
+
+    Source: arXiv:2206.10369, sections 2.1 and A.3.
+    """
+
+    def __init__(
+        self,
+        method: str,
+        *,
+        update_interval: int | None = None,
+        drop_fraction: float | None = None,
+        begin: float | None = None,
+        end: float | None = None,
+        update_on: str | None = None,
+        verbose: int = 0,
+    ) -> None:
+        super().__init__(verbose)
+        topology = method_named(method)
+        given = {
+            "update_interval": update_interval,
+            "drop_fraction": drop_fraction,
+            "begin": begin,
+            "end": end,
+            "update_on": update_on,
+        }
+        given = {name: value for name, value in given.items() if value is not None}
+        unused = sorted(given.keys() - topology.options)
+        if unused:
+            raise ConfigError(
+                f"method {method!r} has no {', '.join(unused)}; it takes "
+                f"{', '.join(sorted(topology.options)) or 'no options'}"
+            )
+        self.plan = Plan(method, **{**DEFAULTS, "begin": topology.default_begin, **given})  # type: ignore[arg-type]
+
+    def _sparse_policy(self) -> SparsePolicyMixin:
+        policy = self.model.policy
+        if not isinstance(policy, SparsePolicyMixin):
+            raise ConfigError(
+                f"SparsityCallback needs a sparse policy, got {type(policy).__name__}; make the model "
+                'with SparsePolicy, e.g. SAC("SparsePolicy", env, policy_kwargs=dict(sparsity=0.9))'
+            )
+        return policy
+
+    def _init_callback(self) -> None:
+        policy = self._sparse_policy()
+        networks = policy.sparse.networks
+        denser = any(network.initial_sparsity < network.sparsity for network in networks)
+        if self.plan.topology.reaches_final and not denser:
+            raise ConfigError(
+                f"method {self.plan.method!r} needs a policy that starts denser than it ends: add "
+                "initial_sparsity=0.0 to policy_kwargs"
+            )
+        if not self.plan.topology.reaches_final and denser:
+            raise ConfigError(
+                f"the policy starts at initial_sparsity={policy.sparsity_config.initial_sparsity}, and "
+                f"method {self.plan.method!r} would never take it to its sparsity; use 'prune', or "
+                "leave initial_sparsity out"
+            )
+        policy.sparse.plan = None  # of a run that was interrupted
+
+    def _on_training_start(self) -> None:
+        sparse = self._sparse_policy().sparse
+        if sparse.plan is not None:
+            raise ConfigError("two SparsityCallbacks are at work on one model; keep one")
+        tau = getattr(self.model, "tau", 1.0)
+        sparse.start(self.plan, soft_targets=tau < 1.0)
+        self._note_progress()
+
+    def _on_rollout_start(self) -> None:
+        self._sparse_policy().sparse.flush()
+
+    def _on_step(self) -> bool:
+        self._note_progress()
+        return True
+
+    def _on_rollout_end(self) -> None:
+        self._log()
+
+    def _on_training_end(self) -> None:
+        self._note_progress()
+        self._sparse_policy().sparse.stop()
+        self._log()
+
+    def _note_progress(self) -> None:
+        planned = self.model._total_timesteps
+        self._sparse_policy().sparse.progress = self.model.num_timesteps / planned
+
+    def _log(self) -> None:
+        sparse = self._sparse_policy().sparse
+        networks = sparse.networks
+        record = self.logger.record
+        nnz = sum(network.nnz for network in networks)
+        record("sparsity/total", 1.0 - nnz / sum(network.size for network in networks))
+        for network in networks:
+            record(f"sparsity/{network.name}", 1.0 - network.nnz / network.size)
+        record("sparsity/nnz", nnz)
+        record("sparsity/mask_updates", max(network.mask_updates for network in networks))
+        record("sparsity/mask_churn", max(network.churn for network in networks))
+        record("sparsity/drop_fraction", self.plan.drop_fraction_at(sparse.progress))

@@ -1,0 +1,1 @@
+"""The torch mechanism of sparse training: layers, gradient masks, moments, clocks. Knows no SB3."""

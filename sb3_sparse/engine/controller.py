@@ -1,0 +1,205 @@
+"""Keeps time and moves masks: hooks on gradients and optimizers of one policy."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from functools import partial
+from typing import Any
+
+import torch as th
+from torch.utils.hooks import RemovableHandle
+
+from sb3_sparse.engine.gradients import (
+    AccumulatedGradient,
+    FunctionalGradient,
+    GradientMask,
+    follow_mask,
+)
+from sb3_sparse.engine.layers import MaskedLayer
+from sb3_sparse.engine.moments import keep_only
+from sb3_sparse.engine.network import SparseNetwork
+from sb3_sparse.engine.plan import Plan
+
+
+class Controller:
+    """Hooks of a policy's sparse networks.
+
+    Each gradient is masked where it arrives, before anything clips it. Each optimizer's step first
+    advances the clocks of the networks it owns and, where an update is due, moves their masks; the
+    step itself is then taken with gradients under the new mask.
+
+    Copies and pickles of a controller have no hooks until :meth:`attach` is called again.
+
+    :param networks: the sparse networks
+    :param seed: mask seed, not negative
+    :param functional_gradients: whether the algorithm may take gradients with
+        ``torch.autograd.grad`` (see :mod:`sb3_sparse.engine.gradients`)
+    """
+
+    def __init__(
+        self, networks: list[SparseNetwork], seed: int, functional_gradients: bool
+    ) -> None:
+        self.networks = networks
+        self.seed = seed
+        self.functional_gradients = functional_gradients
+        self.plan: Plan | None = None
+        self.progress = 0.0
+        self.soft_targets = True
+        self._handles: list[RemovableHandle] = []
+        self._hooked: list[object] = []
+        self._gradient_masks: dict[str, GradientMask] = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {
+            **self.__dict__,
+            "_handles": [],
+            "_hooked": [],
+            "_gradient_masks": {},
+        }
+
+    @property
+    def layers(self) -> Iterable[MaskedLayer]:
+        """Every sparse layer once."""
+        return (layer for network in self.networks for layer in network.layers)
+
+    @property
+    def optimizers(self) -> list[th.optim.Optimizer]:
+        """Every optimizer that owns a network, once."""
+        return list({id(n.optimizer): n.optimizer for n in self.networks}.values())
+
+    def attach(self) -> None:
+        """Register the hooks, unless they already are on these very weights and optimizers."""
+        hooked = [*(layer.weight for layer in self.layers), *self.optimizers]
+        if len(hooked) == len(self._hooked) and all(
+            a is b for a, b in zip(hooked, self._hooked, strict=True)
+        ):
+            return
+        for handle in self._handles:
+            handle.remove()
+        kind = FunctionalGradient if self.functional_gradients else AccumulatedGradient
+        self._gradient_masks = {
+            layer.name: kind(layer, partial(self._capturing, network))
+            for network in self.networks
+            for layer in network.layers
+        }
+        self._handles = [mask.attach() for mask in self._gradient_masks.values()]
+        for optimizer in self.optimizers:
+            self._handles += [
+                optimizer.register_step_pre_hook(self._before_step),
+                optimizer.register_load_state_dict_post_hook(self._after_load),
+            ]
+        self._hooked = list(hooked)
+
+    def begin_training(self) -> None:
+        """Called at the start of each round of gradient steps: hooks in place, no old gradients."""
+        self.attach()
+        for mask in self._gradient_masks.values():
+            mask.dense_grad = None
+
+    def start(self, plan: Plan, soft_targets: bool) -> None:
+        """Let masks move from now on.
+
+        :param soft_targets: whether targets follow the mask at once (Polyak averaging) or keep
+            their snapshot until the next hard copy
+        """
+        self.plan = plan
+        self.soft_targets = soft_targets
+
+    def stop(self) -> None:
+        """Do what is still due and freeze the masks."""
+        self.flush()
+        for network in self.networks:
+            if self.plan is not None and self._must_finish(network, self.plan):
+                self._move(network, self.plan, {})
+        self.plan = None
+
+    def flush(self) -> None:
+        """Carry out updates that waited for the end of the rollout."""
+        for network in self.networks:
+            if network.pending is not None and self.plan is not None:
+                self._move(network, self.plan, network.pending)
+            network.pending = None
+
+    def _must_finish(self, network: SparseNetwork, plan: Plan) -> bool:
+        return (
+            plan.topology.reaches_final
+            and self.progress >= plan.end
+            and any(layer.nnz > layer.final_nnz for layer in network.layers)
+        )
+
+    def _capturing(self, network: SparseNetwork) -> bool:
+        plan = self.plan
+        if plan is None or not plan.topology.grows:
+            return False
+        # A rollout's actor gradient comes before the steps of the rollout are counted.
+        return self.functional_gradients or (network.clock + 1) % plan.update_interval == 0
+
+    def _before_step(self, optimizer: th.optim.Optimizer, args: object, kwargs: object) -> None:
+        for network in self.networks:
+            if network.optimizer is not optimizer:
+                continue
+            network.clock += 1
+            self._mask_moments(network)
+            if self.functional_gradients:
+                _remask_moved_by_hand(network)
+            plan = self.plan
+            if plan is None:
+                continue
+            gradients = network.take_gradients(self._gradient_masks)
+            if plan.due(network.clock, self.progress) or self._must_finish(network, plan):
+                if plan.update_on == "step":
+                    self._move(network, plan, gradients)
+                else:
+                    network.pending = gradients
+
+    def _mask_moments(self, network: SparseNetwork) -> None:
+        for layer in network.layers:
+            if layer.moments_stale:
+                for optimizer in self.optimizers:
+                    keep_only(optimizer, layer.weight, layer.float_mask)
+                layer.moments_stale = False
+
+    def _after_load(self, optimizer: th.optim.Optimizer) -> None:
+        for layer in self.layers:
+            layer.moments_stale = True
+
+    def _move(
+        self, network: SparseNetwork, plan: Plan, gradients: dict[str, th.Tensor | None]
+    ) -> None:
+        moment = plan.moment(network.clock, self.progress, self.seed)
+        nnz = network.nnz
+        dropped = grown = 0
+        for layer in network.layers:
+            gradient = gradients.get(layer.name)
+            if plan.topology.needs_gradient and (gradient is None or layer.full):
+                continue
+            dense_grad = None
+            if plan.topology.needs_gradient and gradient is not None:
+                dense_grad = gradient.detach().cpu().numpy().ravel()
+            exchange = plan.topology.exchange(layer, moment, dense_grad=dense_grad)
+            if not exchange:
+                continue
+            old_mask = layer.float_mask.clone()
+            kept = layer.drop_grow(exchange)
+            for optimizer in self.optimizers:
+                keep_only(optimizer, layer.weight, kept)
+            if self.soft_targets:
+                layer.mask_targets()
+            if plan.update_on == "step":
+                follow_mask(layer.weight.grad, gradient, old_mask, layer.float_mask)
+            dropped += exchange.dropped.size
+            grown += exchange.grown.size
+        if dropped or grown:
+            network.mask_updates += 1
+            network.churn = dropped / nnz
+
+
+def _remask_moved_by_hand(network: SparseNetwork) -> None:
+    """TRPO writes the actor's weights itself, just before the critic's steps.
+
+    Its conjugate gradient starts from noise, so a trace of that is left where nothing is active.
+    """
+    with th.no_grad():
+        for layer in network.layers:
+            if layer.weight.grad is None and not layer.full:
+                layer.weight.mul_(layer.float_mask)

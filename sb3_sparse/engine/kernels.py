@@ -1,0 +1,41 @@
+"""Which weights of a module are kernels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+from torch import nn
+
+from sb3_sparse.errors import UnsupportedError
+
+Kernel = nn.Linear | nn.Conv1d | nn.Conv2d | nn.Conv3d
+KERNEL_TYPES = (nn.Linear, nn.Conv1d, nn.Conv2d, nn.Conv3d)
+UNSUPPORTED_TYPES = (
+    nn.RNNBase,
+    nn.RNNCellBase,
+    nn.MultiheadAttention,
+    nn.Bilinear,
+    nn.ConvTranspose1d,
+    nn.ConvTranspose2d,
+    nn.ConvTranspose3d,
+)
+
+
+def find_kernels(
+    root: nn.Module, prefix: str, stays_dense: Callable[[str], bool]
+) -> Iterator[tuple[str, Kernel]]:
+    """Every Linear and Conv layer below ``root``, in the order of its modules.
+
+    :param root: module to search
+    :param prefix: dotted name of ``root``
+    :param stays_dense: whether the user asked to leave the layer of that name dense
+    :raises UnsupportedError: for a layer with weights that can be neither masked nor overlooked
+    """
+    for name, module in root.named_modules(prefix=prefix):
+        if isinstance(module, UNSUPPORTED_TYPES) and not stays_dense(name):
+            raise UnsupportedError(
+                f"{name} is a {type(module).__name__}, whose weights cannot be made sparse (Linear "
+                f'and Conv layers can); keep it dense with dense_layers=["{name}*"]'
+            )
+        if isinstance(module, KERNEL_TYPES):
+            yield name, module

@@ -1,0 +1,102 @@
+"""A network: the layers that share one budget, and the clock of the optimizer that owns them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch as th
+from torch import nn
+
+from sb3_sparse.engine.gradients import GradientMask
+from sb3_sparse.engine.kernels import Kernel
+from sb3_sparse.engine.layers import MaskedLayer
+from sb3_sparse.sparsity.distributions import active_counts
+from sb3_sparse.sparsity.initialisation import random_mask, sparsity_aware_weights
+
+
+class SparseNetwork:
+    """The layers of one network.
+
+    :param name: e.g. ``"actor"``
+    :param owner: module whose attribute ``optimizer`` moves the network
+    :param kernels: its layers within the budget, by dotted name
+    :param dense_kernels: its layers left dense, outside the budget
+    """
+
+    def __init__(
+        self,
+        name: str,
+        owner: nn.Module,
+        kernels: Sequence[tuple[str, Kernel]],
+        dense_kernels: Sequence[tuple[str, Kernel]] = (),
+    ) -> None:
+        self.name = name
+        self.owner = owner
+        self.layers = [MaskedLayer(layer_name, module) for layer_name, module in kernels]
+        self.dense_kernels = list(dense_kernels)
+        self.sparsity = 0.0
+        """Sparsity that was asked for, removed fraction of the kernels within the budget."""
+        self.initial_sparsity = 0.0
+        """Sparsity that training starts with."""
+        self.clock = 0
+        """Gradient steps that the owning optimizer has begun."""
+        self.mask_updates = 0
+        """Updates so far in which a connection moved."""
+        self.churn = 0.0
+        """Share of the active connections that the last update dropped."""
+        self.pending: dict[str, th.Tensor | None] | None = None
+        """Dense gradients of an update that waits for the end of the rollout, by layer name."""
+
+    @property
+    def optimizer(self) -> th.optim.Optimizer:
+        """The optimizer that owns the network, as it is now."""
+        optimizer = self.owner.optimizer
+        assert isinstance(optimizer, th.optim.Optimizer)
+        return optimizer
+
+    @property
+    def size(self) -> int:
+        """Connections of the dense network, within the budget."""
+        return sum(layer.size for layer in self.layers)
+
+    @property
+    def nnz(self) -> int:
+        """Active connections, within the budget."""
+        return sum(layer.nnz for layer in self.layers)
+
+    def initialise(
+        self,
+        sparsity: float,
+        initial_sparsity: float,
+        distribution: str,
+        seed: int,
+        gains: dict[str, float] | None,
+    ) -> None:
+        """Draw masks and, if asked, weights; a network that starts dense is left untouched.
+
+        :param sparsity: what it shall have in the end, in [0, 1)
+        :param initial_sparsity: what it starts with, at most ``sparsity``
+        :param distribution: a name of :mod:`sb3_sparse.sparsity.distributions`
+        :param seed: mask seed
+        :param gains: SB3's gain of each layer by name, to redraw the weights by the fans that are
+            there; None keeps SB3's own weights, masked
+        """
+        self.sparsity = sparsity
+        self.initial_sparsity = initial_sparsity
+        shapes = [layer.shape for layer in self.layers]
+        final = active_counts(shapes, sparsity, distribution)
+        initial = active_counts(shapes, initial_sparsity, distribution)
+        for layer, final_nnz, initial_nnz in zip(self.layers, final, initial, strict=True):
+            layer.final_nnz = final_nnz
+            layer.initial_nnz = max(initial_nnz, final_nnz)
+            if initial_sparsity == 0.0:
+                continue
+            mask = random_mask(layer.shape, layer.initial_nnz, seed, layer.name)
+            layer.set_mask(mask)
+            if gains is not None:
+                gain = gains[layer.name]
+                layer.set_weights(sparsity_aware_weights(mask, seed, layer.name, gain))
+
+    def take_gradients(self, masks: dict[str, GradientMask]) -> dict[str, th.Tensor | None]:
+        """Dense gradients of the step that is about to happen, by layer name."""
+        return {layer.name: masks[layer.name].take() for layer in self.layers}

@@ -1,0 +1,34 @@
+"""Exceptions: what a user can do wrong, said in one sentence that names the cure."""
+
+from __future__ import annotations
+
+
+class SparsityError(Exception):
+    """Base of every error that this package raises on purpose."""
+
+
+class ConfigError(SparsityError, ValueError):
+    """A value is outside of what is allowed; the message says what is."""
+
+
+class UnsupportedError(SparsityError, TypeError):
+    """An algorithm, layer or space that sparse training does not cover."""
+
+
+class CorruptStateError(SparsityError, ValueError):
+    """A saved state contradicts itself or does not belong to this policy."""
+
+
+class MissingExtra(SparsityError, ImportError):
+    """An optional dependency is absent.
+
+    :param what: what the user tried to do, e.g. ``"the command line"``
+    :param extra: name of the extra that brings the dependency
+    """
+
+    def __init__(self, what: str, extra: str) -> None:
+        super().__init__(f"{what} needs sb3-sparse[{extra}]: pip install 'sb3-sparse[{extra}]'")
+
+
+class TopologyError(SparsityError, RuntimeError):
+    """A topology method asked for an exchange that no mask allows."""

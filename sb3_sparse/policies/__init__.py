@@ -1,0 +1,1 @@
+"""The SB3 face: sparse policy classes and the names under which SB3 finds them."""

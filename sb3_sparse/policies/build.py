@@ -1,0 +1,148 @@
+"""From a finished SB3 policy to its sparse networks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from typing import TYPE_CHECKING
+
+from torch import nn
+
+from sb3_sparse.engine.kernels import KERNEL_TYPES, find_kernels
+from sb3_sparse.engine.network import SparseNetwork
+from sb3_sparse.errors import ConfigError
+from sb3_sparse.policies.config import SparsityConfig
+from sb3_sparse.policies.spec import (
+    DENSE_WORDS,
+    NetworkKernels,
+    NetworkSpec,
+    input_layers,
+    matches,
+    output_layers,
+)
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.policies import BasePolicy
+
+
+def build_networks(
+    policy: BasePolicy,
+    specs: Mapping[str, NetworkSpec],
+    config: SparsityConfig,
+    seed: int,
+    gain: Callable[[str], float],
+) -> list[SparseNetwork]:
+    """Find the layers, draw masks and weights, and bring the targets in line.
+
+    :param policy: a policy whose constructor has run to its end
+    :param specs: its networks
+    :param config: how sparse they shall be
+    :param seed: mask seed
+    :param gain: SB3's initial gain of a layer, by its name
+    :raises ConfigError: if the configuration does not fit the policy
+    :raises UnsupportedError: for layers that cannot be made sparse
+    """
+    modules = dict(policy.named_modules(remove_duplicate=False))
+    found = _find_layers(policy, modules, specs, config)
+    networks = [
+        SparseNetwork(
+            name, modules[specs[name].owner], kernels=found[name].sparse, dense_kernels=found[name].dense
+        )
+        for name in specs
+    ]
+    sizes = {network.name: network.size for network in networks}
+    for name, size in sizes.items():
+        if size == 0:
+            raise ConfigError(
+                f"dense_layers={list(config.dense_layers)} leaves nothing to make sparse in {name!r}"
+            )
+    sparsities = config.by_network(sizes)
+    for network in networks:
+        sparsity = sparsities[network.name]
+        gains = {layer.name: gain(layer.name) for layer in network.layers}
+        network.initialise(
+            sparsity,
+            config.initial(network.name, sparsity),
+            config.distribution,
+            seed,
+            gains if config.sparsity_aware_init else None,
+        )
+    _add_targets(modules, specs, networks)
+    return networks
+
+
+def kernel_parameters(networks: Iterable[SparseNetwork]) -> list[nn.Parameter]:
+    """Weights of all Linear and Conv layers, the dense ones too."""
+    return [
+        parameter
+        for network in networks
+        for parameter in (
+            *(layer.weight for layer in network.layers),
+            *(module.weight for _, module in network.dense_kernels),
+        )
+    ]
+
+
+def _find_layers(
+    policy: nn.Module,
+    modules: Mapping[str, nn.Module],
+    specs: Mapping[str, NetworkSpec],
+    config: SparsityConfig,
+) -> dict[str, NetworkKernels]:
+    """The layers of each network; one that several reach belongs to the first."""
+    patterns = config.dense_layers
+    seen: set[int] = set()
+    found = {name: NetworkKernels() for name in specs}
+    unmatched = set(patterns)
+    for network, spec in specs.items():
+        kernels = {}
+        for root in spec.roots:
+            if root not in modules:
+                continue
+            for name, module in find_kernels(
+                modules[root], root, lambda name: matches(name, patterns)
+            ):
+                if id(module.weight) not in seen:
+                    seen.add(id(module.weight))
+                    kernels[name] = module
+        words = {
+            "input": input_layers(policy, spec, list(kernels)),
+            "output": output_layers(spec, list(kernels)),
+        }
+        dense = {name for word in words if word in patterns for name in words[word]}
+        for name, module in kernels.items():
+            fits = {p for p in patterns if matches(name, [p])}
+            fits |= {word for word in DENSE_WORDS if word in patterns and name in words[word]}
+            unmatched -= fits
+            kind = found[network].dense if name in dense or fits else found[network].sparse
+            kind.append((name, module))
+    if unmatched:
+        names = [name for kernels in found.values() for name, _ in kernels.sparse + kernels.dense]
+        raise ConfigError(
+            f"dense_layers has {', '.join(map(repr, sorted(unmatched)))}, which is no layer of this "
+            f"policy; its layers are {', '.join(names)}, or use the words 'input' and 'output'"
+        )
+    return found
+
+
+def _add_targets(
+    modules: Mapping[str, nn.Module],
+    specs: Mapping[str, NetworkSpec],
+    networks: Iterable[SparseNetwork],
+) -> None:
+    """Give every layer its copies in the target networks, found by the same name below the target."""
+    layers = {id(layer.weight): layer for network in networks for layer in network.layers}
+    done: set[int] = set()
+    for spec in specs.values():
+        if spec.target is None:
+            continue
+        (root,) = spec.roots
+        for name, module in modules[root].named_modules():
+            if not isinstance(module, KERNEL_TYPES):
+                continue
+            layer = layers.get(id(module.weight))
+            target = modules[f"{spec.target}.{name}"]
+            if layer is None or id(target) in done:
+                continue
+            assert isinstance(target, KERNEL_TYPES)
+            done.add(id(target))
+            layer.add_target(target)

@@ -1,0 +1,115 @@
+"""The sparse arguments of a policy, checked when made."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from sb3_sparse.errors import ConfigError
+from sb3_sparse.sparsity.budgets import split_sparsity
+from sb3_sparse.sparsity.distributions import check_distribution, check_sparsity
+
+SPARSITY_MISSING = (
+    "a sparse policy needs its sparsity, e.g. policy_kwargs=dict(sparsity=0.9): the removed fraction "
+    "of connections, in [0, 1). There is no default, so that a lost value cannot train dense"
+)
+
+
+@dataclass(frozen=True)
+class SparsityConfig:
+    """How sparse a policy shall be.
+
+    :param sparsity: removed fraction of the kernels' connections, in [0, 1), for every network, or
+        one for each network by name, e.g. ``{"actor": 0.95, "critic": 0.8}``
+    :param initial_sparsity: what training starts with; None: the same; 0.0 for pruning
+    :param distribution: ``"erk"``, ``"er"`` or ``"uniform"``
+    :param actor_share: fraction of all remaining connections that the actor gets (all critics
+        counted); None: actor and critic equally sparse
+    :param dense_layers: layers left dense and outside the budget, by name pattern
+        (``"actor.mu"``, ``"critic.qf*.4"``) or by the words ``"input"`` and ``"output"``
+    :param sparsity_aware_init: draw the weights by the fans that are there (a network that starts
+        dense keeps SB3's own)
+    :param mask_seed: seed of masks and growth; None: the seed that torch was given, which is SB3's
+        ``seed`` argument
+    :raises ConfigError: for a value that is not allowed
+    """
+
+    sparsity: float | Mapping[str, float] | None
+    initial_sparsity: float | None = None
+    distribution: str = "erk"
+    actor_share: float | None = None
+    dense_layers: Sequence[str] = ()
+    sparsity_aware_init: bool = True
+    mask_seed: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.sparsity is None:
+            raise ConfigError(SPARSITY_MISSING)
+        if isinstance(self.sparsity, Mapping):
+            for name, value in self.sparsity.items():
+                check_sparsity(value, f"sparsity of {name!r}")
+            if self.actor_share is not None:
+                raise ConfigError(
+                    "sparsity is given for each network and actor_share as well; give one number as "
+                    "sparsity to have it shared out"
+                )
+        else:
+            check_sparsity(self.sparsity)
+        if self.initial_sparsity is not None:
+            check_sparsity(self.initial_sparsity, "initial_sparsity")
+        check_distribution(self.distribution)
+        if isinstance(self.dense_layers, str) or not all(
+            isinstance(pattern, str) for pattern in self.dense_layers
+        ):
+            raise ConfigError(
+                f'dense_layers must be a list of names, e.g. ["output"], got {self.dense_layers!r}'
+            )
+        if not isinstance(self.sparsity_aware_init, bool):
+            raise ConfigError(
+                f"sparsity_aware_init must be true or false, got {self.sparsity_aware_init!r}"
+            )
+        if self.mask_seed is not None and (type(self.mask_seed) is not int or self.mask_seed < 0):
+            raise ConfigError(
+                f"mask_seed must be a whole number, 0 or more, got {self.mask_seed!r}"
+            )
+
+    def by_network(self, sizes: Mapping[str, int]) -> dict[str, float]:
+        """The sparsity of each network.
+
+        :param sizes: dense connections of each network, within the budget
+        :raises ConfigError: if names do not match or a share is infeasible
+        """
+        assert self.sparsity is not None
+        names = ", ".join(repr(name) for name in sizes)
+        if isinstance(self.sparsity, Mapping):
+            if set(self.sparsity) != set(sizes):
+                raise ConfigError(
+                    f"sparsity is given for {', '.join(repr(n) for n in self.sparsity)}; this policy "
+                    f"has the networks {names}: name each of them, or give one number"
+                )
+            return {name: float(self.sparsity[name]) for name in sizes}
+        if self.actor_share is None:
+            return {name: float(self.sparsity) for name in sizes}
+        if set(sizes) != {"actor", "critic"}:
+            raise ConfigError(
+                f"actor_share needs an actor and a critic; this policy has {names}"
+            )
+        actor, critic = split_sparsity(
+            sizes["actor"], sizes["critic"], self.sparsity, self.actor_share
+        )
+        return {"actor": actor, "critic": critic}
+
+    def initial(self, network: str, final: float) -> float:
+        """The sparsity that a network starts with.
+
+        :param final: what it shall have in the end
+        :raises ConfigError: if it would start sparser than it ends
+        """
+        if self.initial_sparsity is None:
+            return final
+        if self.initial_sparsity > final:
+            raise ConfigError(
+                f"initial_sparsity={self.initial_sparsity} is above the sparsity {final} of "
+                f"{network!r}; pruning only removes, so start at or below it (0.0 is dense)"
+            )
+        return float(self.initial_sparsity)

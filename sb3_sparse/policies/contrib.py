@@ -1,0 +1,60 @@
+"""Sparse policies of sb3-contrib: TQC, QR-DQN and CrossQ."""
+
+from __future__ import annotations
+
+from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, NatureCNN
+
+from sb3_sparse.errors import MissingExtra
+from sb3_sparse.policies.mixin import SparsePolicyMixin, with_extractor
+from sb3_sparse.policies.sac import GAUSSIAN_ACTOR, TWIN_CRITIC
+from sb3_sparse.policies.spec import NetworkSpec
+
+try:
+    from sb3_contrib.crossq.policies import CrossQPolicy
+    from sb3_contrib.qrdqn.policies import QRDQNPolicy
+    from sb3_contrib.tqc.policies import TQCPolicy
+except ImportError as error:
+    raise MissingExtra("a sparse policy of TQC, QRDQN, CrossQ or TRPO", "contrib") from error
+
+
+class SparseTQCPolicy(SparsePolicyMixin, TQCPolicy):
+    """Sparse actor and quantile critics for TQC."""
+
+    networks = {"actor": GAUSSIAN_ACTOR, "critic": TWIN_CRITIC}
+
+
+SparseTQCMlpPolicy = with_extractor(SparseTQCPolicy, "Mlp", FlattenExtractor)
+SparseTQCCnnPolicy = with_extractor(SparseTQCPolicy, "Cnn", NatureCNN)
+SparseTQCMultiInputPolicy = with_extractor(SparseTQCPolicy, "MultiInput", CombinedExtractor)
+
+
+class SparseQRDQNPolicy(SparsePolicyMixin, QRDQNPolicy):
+    """Sparse quantile network for QR-DQN."""
+
+    networks = {
+        "quantile_net": NetworkSpec(
+            roots=("quantile_net",),
+            trunks=("quantile_net.quantile_net",),
+            heads=("quantile_net.quantile_net",),
+            target="quantile_net_target",
+        )
+    }
+
+
+SparseQRDQNMlpPolicy = with_extractor(SparseQRDQNPolicy, "Mlp", FlattenExtractor)
+SparseQRDQNCnnPolicy = with_extractor(SparseQRDQNPolicy, "Cnn", NatureCNN)
+SparseQRDQNMultiInputPolicy = with_extractor(SparseQRDQNPolicy, "MultiInput", CombinedExtractor)
+
+
+class SparseCrossQPolicy(SparsePolicyMixin, CrossQPolicy):
+    """Sparse actor and critics for CrossQ, which has no target network."""
+
+    networks = {
+        "actor": GAUSSIAN_ACTOR,
+        "critic": NetworkSpec(
+            roots=("critic",), trunks=("critic.qf*",), heads=("critic.qf*",), owner="critic"
+        ),
+    }
+
+
+SparseCrossQMlpPolicy = with_extractor(SparseCrossQPolicy, "Mlp", FlattenExtractor)

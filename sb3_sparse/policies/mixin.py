@@ -1,0 +1,186 @@
+"""What makes an SB3 policy sparse; the policy files only say where."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar, TypeVar
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.type_aliases import Schedule
+
+from sb3_sparse.engine.controller import Controller
+from sb3_sparse.engine.optimizers import check_weight_decay, rebuild
+from sb3_sparse.errors import CorruptStateError
+from sb3_sparse.policies.build import build_networks, kernel_parameters
+from sb3_sparse.policies.config import SparsityConfig
+from sb3_sparse.policies.extractors import choose_extractor
+from sb3_sparse.policies.report import SparsityReport, report_on
+from sb3_sparse.policies.spec import NetworkSpec
+
+Sparse = TypeVar("Sparse", bound="SparsePolicyMixin")
+
+
+class SparsePolicyMixin(BasePolicy):
+    """Sparse networks inside an SB3 policy. SB3's own arguments keep their meaning.
+
+    :param observation_space: as in SB3
+    :param action_space: as in SB3
+    :param lr_schedule: as in SB3
+    :param sparsity: removed fraction of the kernels' connections, in [0, 1), or one for each
+        network, e.g. ``{"actor": 0.95, "critic": 0.8}``; required
+    :param initial_sparsity: what training starts with; None: the same; 0.0 for pruning
+    :param distribution: ``"erk"``, ``"er"`` or ``"uniform"``
+    :param actor_share: fraction of all remaining connections that the actor gets; None: equally sparse
+    :param dense_layers: layers left dense, by name pattern or the words ``"input"``, ``"output"``
+    :param sparsity_aware_init: draw the weights by the fans that are there
+    :param weight_decay: coupled L2 on kernels only
+    :param mask_seed: seed of masks and growth; None: the seed that torch was given, which is SB3's
+    :param kwargs: SB3's own policy arguments
+    :raises ConfigError: for a value that is not allowed
+    :raises UnsupportedError: for layers or observations that cannot be trained sparsely
+
+    Source: arXiv:2206.10369.
+    """
+
+    networks: ClassVar[Mapping[str, NetworkSpec]]
+    """Name of each network and where its modules are."""
+    functional_gradients: ClassVar[bool] = False
+    """Whether an algorithm of this policy takes gradients with ``torch.autograd.grad``."""
+    extractor_class: ClassVar[type[BaseFeaturesExtractor] | None] = None
+    """Features extractor by default; None chooses by the observation space."""
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Space,
+        lr_schedule: Schedule,
+        *,
+        sparsity: float | Mapping[str, float] | None = None,
+        initial_sparsity: float | None = None,
+        distribution: str = "erk",
+        actor_share: float | None = None,
+        dense_layers: Sequence[str] = (),
+        sparsity_aware_init: bool = True,
+        weight_decay: float = 0.0,
+        mask_seed: int | None = None,
+        **kwargs: Any,
+    ) -> None:
+        config = SparsityConfig(
+            sparsity=sparsity,
+            initial_sparsity=initial_sparsity,
+            distribution=distribution,
+            actor_share=actor_share,
+            dense_layers=dense_layers,
+            sparsity_aware_init=sparsity_aware_init,
+            mask_seed=mask_seed,
+        )
+        weight_decay = check_weight_decay(weight_decay, kwargs.get("optimizer_kwargs"))
+        if "features_extractor_class" not in kwargs:
+            kwargs["features_extractor_class"] = self.extractor_class or choose_extractor(
+                observation_space, kwargs.get("normalize_images", True)
+            )
+        super().__init__(observation_space, action_space, lr_schedule, **kwargs)
+        self.sparsity_config = config
+        self.weight_decay = weight_decay
+        seed = th.initial_seed() % 2**63 if mask_seed is None else mask_seed
+        networks = build_networks(self, self.networks, config, seed, self._initial_gain)
+        for owner in {id(n.owner): n.owner for n in networks}.values():
+            owner.optimizer = rebuild(
+                owner.optimizer, self.optimizer_kwargs, kernel_parameters(networks), weight_decay
+            )
+        self.sparse = Controller(networks, seed, self.functional_gradients)
+        self.sparse.attach()
+
+    def _initial_gain(self, layer_name: str) -> float:
+        """Gain with which SB3 initialises the layer, relative to its default."""
+        return 1.0
+
+    def sparsity_report(self) -> SparsityReport:
+        """Every layer's shape, nnz, density and FLOPs; ``print`` it for a table."""
+        return report_on(self)
+
+    def set_training_mode(self, mode: bool) -> None:
+        """As in SB3. Every ``train()`` calls it first, so a copied policy gets its hooks back here."""
+        super().set_training_mode(mode)
+        if mode:
+            self.sparse.begin_training()
+
+    def load_from_vector(self, vector: np.ndarray[Any, Any]) -> None:
+        """As in SB3; what the masks have inactive stays 0."""
+        super().load_from_vector(vector)
+        for layer in self.sparse.layers:
+            layer.apply_mask()
+            layer.mask_targets()
+
+    def load_state_dict(
+        self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False
+    ) -> Any:
+        """As in torch; weights without masks (of a dense policy) are masked, targets too."""
+        incompatible = super().load_state_dict(state_dict, strict=strict, assign=assign)
+        if not any(key.endswith(".weight_mask") for key in state_dict):
+            for layer in self.sparse.layers:
+                layer.mask_targets()
+        return incompatible
+
+    def get_extra_state(self) -> th.Tensor:
+        """Mask seed, then clock and number of mask updates of each network; int64."""
+        numbers = [self.sparse.seed]
+        for network in self.sparse.networks:
+            numbers += [network.clock, network.mask_updates]
+        return th.tensor(numbers, dtype=th.int64)
+
+    def set_extra_state(self, state: th.Tensor) -> None:
+        """Take back what :meth:`get_extra_state` gave.
+
+        :raises CorruptStateError: if it is not of this policy
+        """
+        networks = self.sparse.networks
+        expected = 1 + 2 * len(networks)
+        if not isinstance(state, th.Tensor) or state.shape != (expected,) or bool((state < 0).any()):
+            raise CorruptStateError(
+                f"the saved sparsity state must be {expected} numbers, 0 or more (seed, and clock and "
+                f"updates of {', '.join(n.name for n in networks)}), got {state!r}; the file is "
+                "damaged or belongs to a policy of another kind"
+            )
+        seed, *numbers = state.tolist()
+        self.sparse.seed = int(seed)
+        for network, clock, updates in zip(networks, numbers[::2], numbers[1::2], strict=True):
+            network.clock, network.mask_updates = int(clock), int(updates)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        data = super()._get_constructor_parameters()
+        config = self.sparsity_config
+        data.update(
+            sparsity=config.sparsity,
+            initial_sparsity=config.initial_sparsity,
+            distribution=config.distribution,
+            actor_share=config.actor_share,
+            dense_layers=list(config.dense_layers),
+            sparsity_aware_init=config.sparsity_aware_init,
+            mask_seed=config.mask_seed,
+            weight_decay=self.weight_decay,
+        )
+        if hasattr(self, "share_features_extractor"):  # SB3 forgets it for some of its policies
+            data["share_features_extractor"] = self.share_features_extractor
+        return data
+
+
+def with_extractor(
+    policy: type[Sparse], prefix: str, extractor: type[BaseFeaturesExtractor]
+) -> type[Sparse]:
+    """A subclass of ``policy`` with another default features extractor.
+
+    :param prefix: what to put between the class name and ``Policy``, e.g. ``"Cnn"``; the module must
+        bind the class to that name, or it cannot be pickled
+    """
+    name = policy.__name__.removesuffix("Policy") + prefix + "Policy"
+    members = {
+        "__module__": policy.__module__,
+        "__doc__": f"{policy.__name__} with {extractor.__name__} by default.",
+        "extractor_class": extractor,
+    }
+    return type(name, (policy,), members)

@@ -1,0 +1,186 @@
+"""A table of a policy's layers."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.preprocessing import preprocess_obs
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from torch import nn
+
+from sb3_sparse.engine.kernels import Kernel
+
+if TYPE_CHECKING:
+    from sb3_sparse.policies.mixin import SparsePolicyMixin
+
+
+@dataclass(frozen=True)
+class LayerReport:
+    """One layer.
+
+    :param network: name of the network that it belongs to
+    :param name: dotted name within the policy
+    :param shape: weight shape, torch order
+    :param nnz: active connections
+    :param parameters: nnz and biases
+    :param flops: of one forward pass at batch 1: multiply-adds count 2, biases and activations 1
+    :param dense_flops: the same for the dense layer
+    :param in_budget: False for a layer left dense by ``dense_layers``
+    """
+
+    network: str
+    name: str
+    shape: tuple[int, ...]
+    nnz: int
+    parameters: int
+    flops: int
+    dense_flops: int
+    in_budget: bool
+
+    @property
+    def size(self) -> int:
+        """Connections of the dense layer."""
+        return math.prod(self.shape)
+
+    @property
+    def density(self) -> float:
+        """Active fraction."""
+        return self.nnz / self.size
+
+
+@dataclass(frozen=True)
+class SparsityReport:
+    """All layers of a policy, target networks not counted."""
+
+    layers: tuple[LayerReport, ...]
+
+    def sparsity(self, network: str | None = None) -> float:
+        """Removed fraction of the kernels within the budget, of one network or of all."""
+        layers = [r for r in self.layers if r.in_budget and network in (None, r.network)]
+        return 1.0 - sum(r.nnz for r in layers) / sum(r.size for r in layers)
+
+    @property
+    def nnz(self) -> int:
+        """Active connections, layers left dense included."""
+        return sum(r.nnz for r in self.layers)
+
+    @property
+    def parameters(self) -> int:
+        """Active connections and biases, layers left dense included."""
+        return sum(r.parameters for r in self.layers)
+
+    def __str__(self) -> str:
+        head = ("layer", "shape", "nnz", "density", "FLOPs", "of dense")
+        rows = [
+            (
+                r.name,
+                "x".join(map(str, r.shape)),
+                f"{r.nnz:,}",
+                f"{r.density:.4f}" if r.in_budget else "dense",
+                f"{r.flops:,}",
+                f"{r.flops / r.dense_flops:.3f}",
+            )
+            for r in self.layers
+        ]
+        flops, dense = (sum(getattr(r, k) for r in self.layers) for k in ("flops", "dense_flops"))
+        size = sum(r.size for r in self.layers)
+        total = ("total", "", f"{self.nnz:,}", f"{self.nnz / size:.4f}", f"{flops:,}")
+        rows.append((*total, f"{flops / dense:.3f}"))
+        widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
+        lines = [
+            "  ".join(
+                cell.ljust(width) if i < 2 else cell.rjust(width)
+                for i, (cell, width) in enumerate(zip(row, widths, strict=True))
+            ).rstrip()
+            for row in (head, *rows)
+        ]
+        networks = list(dict.fromkeys(r.network for r in self.layers))
+        summary = ", ".join(f"{name} {self.sparsity(name):.4f}" for name in networks)
+        return "\n".join(
+            [
+                *lines,
+                f"sparsity: {summary}, total {self.sparsity():.4f}",
+                f"parameters: {self.parameters:,} (active connections and biases)",
+            ]
+        )
+
+
+def report_on(policy: SparsePolicyMixin) -> SparsityReport:
+    """Collect the report of a policy as it is now."""
+    positions = _conv_positions(policy)
+    activated = _activated(policy)
+    layers = []
+    for network in policy.sparse.networks:
+        kernels: list[tuple[str, Kernel, int, bool]] = [
+            (layer.name, layer.module, layer.nnz, True) for layer in network.layers
+        ]
+        kernels += [(n, module, module.weight.numel(), False) for n, module in network.dense_kernels]
+        for name, module, nnz, in_budget in kernels:
+            biases = 0 if module.bias is None else module.bias.numel()
+            units = module.weight.shape[0] if id(module) in activated else 0
+            places = positions.get(id(module), 1)
+            layers.append(
+                LayerReport(
+                    network=network.name,
+                    name=name,
+                    shape=tuple(module.weight.shape),
+                    nnz=nnz,
+                    parameters=nnz + biases,
+                    flops=places * (2 * nnz + biases + units),
+                    dense_flops=places * (2 * module.weight.numel() + biases + units),
+                    in_budget=in_budget,
+                )
+            )
+    return SparsityReport(tuple(layers))
+
+
+def _activated(policy: nn.Module) -> set[int]:
+    """Ids of the layers that an activation function follows."""
+    found = set()
+    for sequence in policy.modules():
+        if isinstance(sequence, nn.Sequential):
+            for layer, after in zip(list(sequence), list(sequence)[1:], strict=False):
+                if type(after).__module__ == "torch.nn.modules.activation":
+                    found.add(id(layer))
+    return found
+
+
+def _conv_positions(policy: SparsePolicyMixin) -> dict[int, int]:
+    """Output positions of each convolution, read off a forward pass of an empty observation."""
+    positions: dict[int, int] = {}
+
+    def note(module: nn.Module, inputs: object, output: th.Tensor) -> None:
+        positions[id(module)] = math.prod(output.shape[2:])
+
+    convs = [m for m in policy.modules() if isinstance(m, (nn.Conv1d, nn.Conv2d, nn.Conv3d))]
+    if not convs:
+        return positions
+    handles = [conv.register_forward_hook(note) for conv in convs]
+    space = policy.observation_space
+    empty = _zeros(space, policy.device)
+    modes = {module: module.training for module in policy.modules()}
+    try:
+        with th.no_grad():
+            observation = preprocess_obs(empty, space, normalize_images=policy.normalize_images)
+            for module in policy.modules():
+                if isinstance(module, BaseFeaturesExtractor) and module._observation_space == space:
+                    module.eval()(observation)
+    finally:
+        for handle in handles:
+            handle.remove()
+        for module, mode in modes.items():
+            module.training = mode
+    return positions
+
+
+def _zeros(space: spaces.Space, device: th.device) -> th.Tensor | dict[str, th.Tensor]:
+    if isinstance(space, spaces.Dict):
+        parts = {key: _zeros(part, device) for key, part in space.spaces.items()}
+        return {key: part for key, part in parts.items() if isinstance(part, th.Tensor)}
+    assert space.shape is not None
+    return th.as_tensor(np.zeros((1, *space.shape), dtype=space.dtype), device=device)

@@ -1,0 +1,34 @@
+"""Sparse policies of SAC."""
+
+from __future__ import annotations
+
+from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, NatureCNN
+from stable_baselines3.sac.policies import SACPolicy
+
+from sb3_sparse.policies.mixin import SparsePolicyMixin, with_extractor
+from sb3_sparse.policies.spec import NetworkSpec
+
+GAUSSIAN_ACTOR = NetworkSpec(
+    roots=("actor",),
+    trunks=("actor.latent_pi",),
+    heads=("actor.mu", "actor.log_std"),
+    owner="actor",
+)
+TWIN_CRITIC = NetworkSpec(
+    roots=("critic",),
+    trunks=("critic.qf*",),
+    heads=("critic.qf*",),
+    target="critic_target",
+    owner="critic",
+)
+
+
+class SparseSACPolicy(SparsePolicyMixin, SACPolicy):
+    """Sparse actor and critics for SAC."""
+
+    networks = {"actor": GAUSSIAN_ACTOR, "critic": TWIN_CRITIC}
+
+
+SparseSACMlpPolicy = with_extractor(SparseSACPolicy, "Mlp", FlattenExtractor)
+SparseSACCnnPolicy = with_extractor(SparseSACPolicy, "Cnn", NatureCNN)
+SparseSACMultiInputPolicy = with_extractor(SparseSACPolicy, "MultiInput", CombinedExtractor)

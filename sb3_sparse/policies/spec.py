@@ -1,0 +1,103 @@
+"""Where a policy class keeps its networks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
+
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from torch import nn
+
+from sb3_sparse.engine.kernels import Kernel
+
+DENSE_WORDS = ("input", "output")
+
+
+@dataclass(frozen=True)
+class NetworkSpec:
+    """One network of a policy, by dotted module names (``fnmatch`` patterns where several match).
+
+    :param roots: modules whose layers belong to the network; one that an earlier network has already
+        (a shared features extractor) stays with that one
+    :param trunks: modules whose first layer reads features
+    :param heads: modules whose last layer is an output
+    :param target: target copy of the one root, if there is one
+    :param owner: module whose ``optimizer`` moves the network; empty: the policy
+    """
+
+    roots: tuple[str, ...]
+    trunks: tuple[str, ...]
+    heads: tuple[str, ...]
+    target: str | None = None
+    owner: str = ""
+
+
+@dataclass
+class NetworkKernels:
+    """The layers found for one network: within the budget, and left dense."""
+
+    sparse: list[tuple[str, Kernel]] = field(default_factory=list)
+    dense: list[tuple[str, Kernel]] = field(default_factory=list)
+
+
+def _within(name: str, patterns: Sequence[str]) -> bool:
+    return any(fnmatchcase(name, p) or fnmatchcase(name, f"{p}.*") for p in patterns)
+
+
+def _by_module(names: Sequence[str], patterns: Sequence[str]) -> Iterator[list[str]]:
+    """Groups of layer names that lie in the same module matched by a pattern."""
+    for pattern in patterns:
+        depth = pattern.count(".") + 1
+        groups: dict[str, list[str]] = {}
+        for name in names:
+            module = ".".join(name.split(".")[:depth])
+            if fnmatchcase(module, pattern):
+                groups.setdefault(module, []).append(name)
+        yield from groups.values()
+
+
+def input_layers(policy: nn.Module, spec: NetworkSpec, names: Sequence[str]) -> set[str]:
+    """Layers that read the observation: the first of each features extractor, else of each trunk.
+
+    :param names: layer names of the network, in module order
+    """
+    found: set[str] = set()
+    in_extractor: set[str] = set()
+    reads_raw = False
+    seen: set[int] = set()
+    for root in spec.roots:
+        if root not in dict(policy.named_modules(remove_duplicate=False)):
+            continue
+        for path, module in policy.get_submodule(root).named_modules(prefix=root):
+            if not isinstance(module, BaseFeaturesExtractor) or id(module) in seen:
+                continue
+            seen.add(id(module))
+            nested = [m for m in module.modules() if isinstance(m, BaseFeaturesExtractor)]
+            layers = [name for name in names if name.startswith(f"{path}.")]
+            in_extractor.update(layers)
+            if len(nested) > 1:  # a CombinedExtractor: its images have extractors of their own
+                reads_raw |= any(isinstance(m, nn.Flatten) for m in _values(module))
+            elif layers:
+                found.add(layers[0])
+    if not in_extractor or reads_raw:
+        rest = [name for name in names if name not in in_extractor]
+        trunks = list(_by_module(rest, spec.trunks)) or list(_by_module(rest, spec.heads))
+        found.update(group[0] for group in trunks)
+    return found
+
+
+def _values(extractor: nn.Module) -> Iterator[nn.Module]:
+    for child in extractor.children():
+        if isinstance(child, nn.ModuleDict):
+            yield from child.values()
+
+
+def output_layers(spec: NetworkSpec, names: Sequence[str]) -> set[str]:
+    """The last layer of each head."""
+    return {group[-1] for group in _by_module(names, spec.heads)}
+
+
+def matches(name: str, patterns: Sequence[str]) -> bool:
+    """Whether a layer's dotted name, or a module around it, matches one of the patterns."""
+    return _within(name, [p for p in patterns if p not in DENSE_WORDS])

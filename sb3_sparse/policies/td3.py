@@ -1,0 +1,30 @@
+"""Sparse policies of TD3 and DDPG."""
+
+from __future__ import annotations
+
+from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, NatureCNN
+from stable_baselines3.td3.policies import TD3Policy
+
+from sb3_sparse.policies.mixin import SparsePolicyMixin, with_extractor
+from sb3_sparse.policies.sac import TWIN_CRITIC
+from sb3_sparse.policies.spec import NetworkSpec
+
+
+class SparseTD3Policy(SparsePolicyMixin, TD3Policy):
+    """Sparse actor and critics for TD3 and DDPG."""
+
+    networks = {
+        "actor": NetworkSpec(
+            roots=("actor",),
+            trunks=("actor.mu",),
+            heads=("actor.mu",),
+            target="actor_target",
+            owner="actor",
+        ),
+        "critic": TWIN_CRITIC,
+    }
+
+
+SparseTD3MlpPolicy = with_extractor(SparseTD3Policy, "Mlp", FlattenExtractor)
+SparseTD3CnnPolicy = with_extractor(SparseTD3Policy, "Cnn", NatureCNN)
+SparseTD3MultiInputPolicy = with_extractor(SparseTD3Policy, "MultiInput", CombinedExtractor)

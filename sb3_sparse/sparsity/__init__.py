@@ -1,0 +1,1 @@
+"""Pure arithmetic of sparse networks: integers and NumPy arrays in, integers and arrays out."""

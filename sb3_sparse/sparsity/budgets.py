@@ -1,0 +1,55 @@
+"""How a sparsity is shared between actor and critics."""
+
+from __future__ import annotations
+
+from sb3_sparse.errors import ConfigError
+from sb3_sparse.sparsity.distributions import check_sparsity
+
+
+def default_actor_share(actor_size: int, critics_size: int) -> float:
+    """Share of the actor at which actor and critics are equally sparse.
+
+    :param actor_size: connections of the dense actor
+    :param critics_size: connections of all dense critics together
+    """
+    return actor_size / (actor_size + critics_size)
+
+
+def feasible_actor_share(
+    actor_size: int, critics_size: int, sparsity: float
+) -> tuple[float, float]:
+    """Smallest and largest actor share for which no network would need more than all it has."""
+    budget = (1.0 - sparsity) * (actor_size + critics_size)
+    return max(0.0, 1.0 - critics_size / budget), min(1.0, actor_size / budget)
+
+
+def split_sparsity(
+    actor_size: int, critics_size: int, sparsity: float, actor_share: float
+) -> tuple[float, float]:
+    """Sparsity of the actor and of each critic for one common budget.
+
+    :param actor_size: connections of the dense actor
+    :param critics_size: connections of all dense critics together (two critics count twice)
+    :param sparsity: removed fraction over actor and critics together, in [0, 1)
+    :param actor_share: fraction of the remaining connections that the actor gets, in (0, 1)
+    :return: ``(actor sparsity, critic sparsity)``
+    :raises ConfigError: if a network would get more connections than it has, or none
+
+    Source: arXiv:2206.10369, figure on the actor-critic ratio.
+    """
+    sparsity = check_sparsity(sparsity)
+    if isinstance(actor_share, bool) or not isinstance(actor_share, (int, float)):
+        raise ConfigError(f"actor_share must be a number in (0, 1), got {actor_share!r}")
+    low, high = feasible_actor_share(actor_size, critics_size, sparsity)
+    budget = (1.0 - sparsity) * (actor_size + critics_size)
+    actor = 1.0 - actor_share * budget / actor_size
+    critic = 1.0 - (1.0 - actor_share) * budget / critics_size
+    # A share at the very edge of what is feasible may miss it by rounding.
+    actor, critic = (0.0 if -1e-9 < value < 0.0 else value for value in (actor, critic))
+    if not (0.0 <= actor < 1.0 and 0.0 <= critic < 1.0):
+        raise ConfigError(
+            f"actor_share={actor_share} is infeasible at sparsity {sparsity}: it would ask for a "
+            f"sparsity of {actor:.4f} in the actor and {critic:.4f} in the critic; choose "
+            f"actor_share between {low:.4f} and {high:.4f} (0 and 1 themselves excluded)"
+        )
+    return actor, critic

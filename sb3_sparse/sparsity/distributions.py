@@ -1,0 +1,123 @@
+"""How a network's sparsity is shared out among its layers.
+
+Sources: uniform and ERK as in arXiv:1911.11134 (RigL), section 3; ER as in arXiv:1707.04780 (SET).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+from sb3_sparse.errors import ConfigError
+
+Shape = Sequence[int]
+
+
+def floor_count(value: float) -> int:
+    """Floor that forgives floating error: ``0.29 * 100`` is 29, not 28.
+
+    :param value: a count that ought to be exact but was computed in floating point
+    """
+    return math.floor(value + 1e-6)
+
+
+def check_sparsity(sparsity: float, what: str = "sparsity") -> float:
+    """Return ``sparsity`` as a float.
+
+    :raises ConfigError: unless it is a number in [0, 1)
+    """
+    if isinstance(sparsity, bool) or not isinstance(sparsity, (int, float)):
+        raise ConfigError(f"{what} must be a number in [0, 1), got {sparsity!r}")
+    if not 0.0 <= sparsity < 1.0:
+        raise ConfigError(
+            f"{what} must lie in [0, 1) (it is the removed fraction of connections), got {sparsity}"
+        )
+    return float(sparsity)
+
+
+def _uniform(shapes: Sequence[Shape], sparsity: float) -> list[float]:
+    return [sparsity] * len(shapes)
+
+
+def _erdos_renyi(
+    shapes: Sequence[Shape], sparsity: float, dims_of: Callable[[Shape], Sequence[int]]
+) -> list[float]:
+    """Densities proportional to ``sum(dims) / prod(dims)``, capped at 1.
+
+    A layer whose share would exceed its size becomes dense and the others pay for it, until no
+    layer exceeds it; layers that tie for the largest score become dense together.
+    """
+    sizes = [math.prod(shape) for shape in shapes]
+    zeros = [floor_count(sparsity * size) for size in sizes]
+    scores = [sum(dims_of(shape)) / math.prod(dims_of(shape)) for shape in shapes]
+    dense: set[int] = set()
+    while len(dense) < len(shapes):
+        free = [i for i in range(len(shapes)) if i not in dense]
+        budget = sum(sizes[i] - zeros[i] for i in free) - sum(zeros[i] for i in dense)
+        epsilon = budget / sum(scores[i] * sizes[i] for i in free)
+        largest = max(scores[i] for i in free)
+        if epsilon * largest <= 1.0:
+            return [
+                0.0 if i in dense else 1.0 - epsilon * scores[i] for i in range(len(shapes))
+            ]
+        dense.update(i for i in free if scores[i] == largest)
+    return [0.0] * len(shapes)
+
+
+def _er(shapes: Sequence[Shape], sparsity: float) -> list[float]:
+    return _erdos_renyi(shapes, sparsity, lambda shape: shape[:2])
+
+
+def _erk(shapes: Sequence[Shape], sparsity: float) -> list[float]:
+    return _erdos_renyi(shapes, sparsity, lambda shape: shape)
+
+
+DISTRIBUTIONS: dict[str, Callable[[Sequence[Shape], float], list[float]]] = {
+    "uniform": _uniform,
+    "er": _er,
+    "erk": _erk,
+}
+
+
+def check_distribution(distribution: str) -> str:
+    """Return ``distribution``.
+
+    :raises ConfigError: if there is none of that name
+    """
+    if distribution not in DISTRIBUTIONS:
+        raise ConfigError(
+            f"unknown distribution {distribution!r}; allowed are {', '.join(sorted(DISTRIBUTIONS))}"
+        )
+    return distribution
+
+
+def active_counts(
+    shapes: Sequence[Shape], sparsity: float, distribution: str = "erk"
+) -> list[int]:
+    """Number of active connections of each layer of one network.
+
+    The number of zeros in a layer is exactly ``floor(s_l * N_l)``, and a layer keeps at least one
+    connection.
+
+    :param shapes: weight shapes in torch order: ``(out, in)`` or ``(out, in, *kernel)``
+    :param sparsity: removed fraction of the network's connections, in [0, 1)
+    :param distribution: ``"uniform"`` (every layer the same), ``"erk"`` (Erdős–Rényi kernel) or
+        ``"er"`` (the same without the kernel's window)
+    :return: nnz per layer, in the order of ``shapes``
+    :raises ConfigError: for a sparsity, distribution or shape that is not allowed
+
+    Source: arXiv:1911.11134, section 3; the kernel's window counts as in arXiv:2206.10369.
+    """
+    sparsity = check_sparsity(sparsity)
+    check_distribution(distribution)
+    for shape in shapes:
+        if len(shape) < 2 or any(dim < 1 for dim in shape):
+            raise ConfigError(
+                f"a weight shape needs two or more positive dimensions (out, in, ...), got {shape!r}"
+            )
+    layer_sparsities = DISTRIBUTIONS[distribution](shapes, sparsity)
+    counts = []
+    for shape, layer_sparsity in zip(shapes, layer_sparsities, strict=True):
+        size = math.prod(shape)
+        counts.append(max(1, size - floor_count(layer_sparsity * size)))
+    return counts

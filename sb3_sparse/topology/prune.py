@@ -1,0 +1,39 @@
+"""Gradual magnitude pruning."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sb3_sparse.sparsity.schedules import pruned_count
+from sb3_sparse.sparsity.selection import least_magnitude
+from sb3_sparse.topology.base import NOTHING, Array, Exchange, Layer, Moment, TopologyMethod
+from sb3_sparse.topology.registry import register
+
+
+@register
+class Prune(TopologyMethod):
+    """Removes the connections of least magnitude along a cubic ramp; what is pruned stays pruned.
+
+    Needs a policy that starts denser than it shall end (``initial_sparsity``, usually 0.0).
+    Source: arXiv:1710.01878.
+    """
+
+    name = "prune"
+    default_begin = 0.2
+    reaches_final = True
+
+    def exchange(self, layer: Layer, moment: Moment, *, dense_grad: Array | None) -> Exchange:
+        keep = pruned_count(
+            layer.size,
+            layer.initial_nnz,
+            layer.final_nnz,
+            moment.progress,
+            moment.begin,
+            moment.end,
+        )
+        surplus = layer.nnz - keep
+        if surplus <= 0:
+            return NOTHING
+        active = np.flatnonzero(layer.mask())
+        dropped = least_magnitude(layer.dense(), active, surplus)
+        return Exchange(dropped=dropped, grown=np.empty(0, dtype=np.int64))

@@ -1,0 +1,46 @@
+"""The methods known by name."""
+
+from __future__ import annotations
+
+from typing import TypeVar
+
+from sb3_sparse.errors import ConfigError
+from sb3_sparse.topology.base import TopologyMethod
+
+_METHODS: dict[str, TopologyMethod] = {}
+Method = TypeVar("Method", bound=TopologyMethod)
+
+
+def register(cls: type[Method]) -> type[Method]:
+    """Class decorator that makes a method known as ``cls.name``.
+
+    :raises ConfigError: if another class has that name already
+    """
+    name = getattr(cls, "name", None)
+    if not isinstance(name, str) or not name:
+        raise ConfigError(f'{cls.__qualname__} needs a class attribute `name`, e.g. name = "mine"')
+    known = _METHODS.get(name)
+    if known is not None and type(known).__qualname__ != cls.__qualname__:
+        raise ConfigError(
+            f"the method name {name!r} is taken by {type(known).__qualname__}; choose another"
+        )
+    _METHODS[name] = cls()
+    return cls
+
+
+def method_names() -> list[str]:
+    """All registered names, sorted."""
+    return sorted(_METHODS)
+
+
+def method_named(name: str) -> TopologyMethod:
+    """The method of that name.
+
+    :raises ConfigError: if there is none
+    """
+    if not isinstance(name, str) or name not in _METHODS:
+        raise ConfigError(
+            f"unknown method {name!r}; allowed are {', '.join(method_names())}. A method of your "
+            "own is a subclass of sb3_sparse.topology.TopologyMethod with @register on it"
+        )
+    return _METHODS[name]

@@ -1,0 +1,17 @@
+"""Static sparse training: the mask never moves."""
+
+from __future__ import annotations
+
+from sb3_sparse.topology.base import NOTHING, Array, Exchange, Layer, Moment, TopologyMethod
+from sb3_sparse.topology.registry import register
+
+
+@register
+class Static(TopologyMethod):
+    """A random mask, fixed for the whole of training. Source: arXiv:2206.10369, section 2.1."""
+
+    name = "static"
+    options = frozenset()
+
+    def exchange(self, layer: Layer, moment: Moment, *, dense_grad: Array | None) -> Exchange:
+        return NOTHING
