@@ -155,9 +155,12 @@ class Controller:
     def _mask_moments(self, network: SparseNetwork) -> None:
         for layer in network.layers:
             if layer.moments_stale:
-                for optimizer in self.optimizers:
-                    keep_only(optimizer, layer.weight, layer.float_mask)
+                self._keep_moments(layer, layer.float_mask)
                 layer.moments_stale = False
+
+    def _keep_moments(self, layer: MaskedLayer, kept: th.Tensor) -> None:
+        for optimizer in self.optimizers:  # a shared extractor may have moments in several
+            keep_only(optimizer, layer.weight, kept)
 
     def _after_load(self, optimizer: th.optim.Optimizer) -> None:
         for layer in self.layers:
@@ -181,8 +184,7 @@ class Controller:
                 continue
             old_mask = layer.float_mask.clone()
             kept = layer.drop_grow(exchange)
-            for optimizer in self.optimizers:
-                keep_only(optimizer, layer.weight, kept)
+            self._keep_moments(layer, kept)
             if self.soft_targets:
                 layer.mask_targets()
             if plan.update_on == "step":

@@ -48,12 +48,14 @@ class AccumulatedGradient(GradientMask):
         return self.layer.weight.register_post_accumulate_grad_hook(self._hook)
 
     def _hook(self, weight: th.Tensor) -> None:
-        if self.layer.full:
+        layer = self.layer
+        if layer.nnz == layer.size:
             return
-        assert weight.grad is not None
+        grad = weight.grad
+        assert grad is not None
         if self.capturing():
-            self.dense_grad = weight.grad.clone()
-        weight.grad.mul_(self.layer.float_mask)
+            self.dense_grad = grad.clone()
+        grad.mul_(layer.float_mask)
 
     def take(self) -> th.Tensor | None:
         dense_grad, self.dense_grad = self.dense_grad, None
@@ -68,11 +70,12 @@ class FunctionalGradient(GradientMask):
         return handle
 
     def _hook(self, grad: th.Tensor) -> th.Tensor | None:
-        if self.layer.full:
+        layer = self.layer
+        if layer.nnz == layer.size:
             return None
         if self.dense_grad is None and not grad.requires_grad and self.capturing():
             self.dense_grad = grad
-        return grad * self.layer.float_mask
+        return grad * layer.float_mask
 
     def take(self) -> th.Tensor | None:
         dense_grad = self.dense_grad

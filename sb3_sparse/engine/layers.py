@@ -14,6 +14,7 @@ from sb3_sparse.errors import TopologyError
 from sb3_sparse.topology import Exchange
 
 MASK_KEY = "weight_mask"
+FLOAT_MASK_KEY = "weight_mask_float"
 
 
 def _ignore_mask_key(
@@ -46,7 +47,7 @@ class MaskedLayer:
         self.moments_stale = False
         ones = th.ones_like(module.weight, requires_grad=False)
         module.register_buffer(MASK_KEY, ones.bool())
-        module.register_buffer(f"{MASK_KEY}_float", ones, persistent=False)
+        module.register_buffer(FLOAT_MASK_KEY, ones, persistent=False)
         module.register_load_state_dict_post_hook(self._after_load)
 
     @property
@@ -62,7 +63,8 @@ class MaskedLayer:
     @property
     def float_mask(self) -> th.Tensor:
         """1.0 where active, else 0.0, in the weight's shape and on its device."""
-        mask = self.module._buffers[f"{MASK_KEY}_float"]
+        # Not through attribute lookup of nn.Module: this is read for every gradient.
+        mask = self.module._buffers[FLOAT_MASK_KEY]
         assert mask is not None
         return mask
 

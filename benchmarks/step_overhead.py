@@ -1,0 +1,180 @@
+"""Cost of one masked gradient step, as a ratio to stock dense Stable-Baselines3.
+
+All variants of a case are timed in turn in one process, so that a machine that slows down slows all
+of them; the median of the ratios, round by round, is what counts.
+
+    python benchmarks/step_overhead.py            # about five minutes
+    python benchmarks/step_overhead.py --rounds 5 --cases SAC
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+from statistics import median
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3 import DQN, PPO, SAC
+
+import sb3_sparse  # noqa: F401  (registers SparsePolicy)
+from sb3_sparse import SparsityCallback
+
+SPARSITY = 0.9
+
+
+class RandomEnv(gym.Env):
+    """Noise of the given spaces; the gradient step does not care what it learns from."""
+
+    def __init__(self, observation_space: spaces.Space, action_space: spaces.Space) -> None:
+        self.observation_space = observation_space
+        self.action_space = action_space
+
+    def reset(self, **kwargs: Any) -> tuple[np.ndarray, dict[str, Any]]:
+        super().reset(seed=kwargs.get("seed"))
+        return self.observation_space.sample(), {}
+
+    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        return self.observation_space.sample(), float(np.random.randn()), False, False, {}
+
+
+VECTOR = spaces.Box(-1.0, 1.0, (17,), np.float32)
+IMAGE = spaces.Box(0, 255, (4, 84, 84), np.uint8)
+TORQUES = spaces.Box(-1.0, 1.0, (6,), np.float32)
+
+
+def off_policy(algo: Any, env: gym.Env, batch: int, steps: int, **settings: Any) -> Callable:
+    """A maker of models whose ``train`` does ``steps`` gradient steps at a call."""
+
+    def make(policy: str, policy_kwargs: dict[str, Any]) -> tuple[Any, Callable[[], None], int]:
+        model = algo(
+            policy, env, seed=0, learning_starts=600, buffer_size=1000, batch_size=batch,
+            policy_kwargs={**settings, **policy_kwargs},
+        )  # fmt: skip
+        model.learn(600)
+        return model, lambda: model.train(gradient_steps=steps, batch_size=batch), steps
+
+    return make
+
+
+def on_policy(env: gym.Env, batch: int, rollout: int) -> Callable:
+    """The same for PPO: one call is an epoch over a rollout."""
+
+    def make(policy: str, policy_kwargs: dict[str, Any]) -> tuple[Any, Callable[[], None], int]:
+        model = PPO(
+            policy, env, seed=0, n_steps=rollout, batch_size=batch, n_epochs=1,
+            policy_kwargs=policy_kwargs,
+        )  # fmt: skip
+        model.learn(rollout)
+        return model, model.train, rollout // batch
+
+    return make
+
+
+CASES: dict[str, tuple[Callable, str, float]] = {
+    "SAC 256x256 batch 256": (off_policy(SAC, RandomEnv(VECTOR, TORQUES), 256, 10), "Mlp", 0.97),
+    "DQN 512x512 batch 128": (
+        off_policy(DQN, RandomEnv(VECTOR, spaces.Discrete(4)), 128, 30, net_arch=[512, 512]),
+        "Mlp",
+        0.90,
+    ),
+    "PPO 64x64 batch 64": (on_policy(RandomEnv(VECTOR, TORQUES), 64, 2048), "Mlp", 0.90),
+    "DQN Nature CNN batch 32": (
+        off_policy(DQN, RandomEnv(IMAGE, spaces.Discrete(6)), 32, 5),
+        "Cnn",
+        0.95,
+    ),
+}
+FUSED = dict(optimizer_kwargs=dict(fused=True))
+SPARSE = dict(sparsity=SPARSITY)
+
+
+def fused_like_stock(model: Any) -> dict[str, Any]:
+    """Stock policy arguments with the optimizer SB3 itself chose, fused."""
+    return dict(optimizer_kwargs={**model.policy.optimizer_kwargs, "fused": True})
+
+
+def time_case(name: str, rounds: int) -> dict[str, tuple[float, float]]:
+    """Milliseconds a step and ratio to stock, by variant."""
+    make, kind, _ = CASES[name]
+    stock = make(f"{kind}Policy", {})
+    eager = {**stock[0].policy.optimizer_kwargs, "fused": False}
+    variants = {
+        "dense, stock": stock,
+        "dense, fused Adam": make(f"{kind}Policy", fused_like_stock(stock[0])),
+        "masked, fused Adam": make("SparsePolicy", dict(SPARSE)),
+        "masked, SB3's Adam": make("SparsePolicy", dict(SPARSE, optimizer_kwargs=eager)),
+    }
+    times: dict[str, list[float]] = {variant: [] for variant in variants}
+    for _ in range(rounds + 1):
+        for variant, (_, train, steps) in variants.items():
+            start = time.perf_counter()
+            train()
+            times[variant].append((time.perf_counter() - start) / steps)
+    for values in times.values():
+        values.pop(0)  # warm-up
+    base = times["dense, stock"]
+    return {
+        variant: (
+            1e3 * median(values),
+            median(value / reference for value, reference in zip(values, base, strict=True)),
+        )
+        for variant, values in times.items()
+    }
+
+
+def time_topology_update(width: int, interval: int) -> tuple[float, float]:
+    """Seconds of one RigL update of a width x width layer, and of ``interval`` gradient steps."""
+    env = RandomEnv(VECTOR, spaces.Discrete(4))
+    make = off_policy(DQN, env, 256, 3, net_arch=[width, width])
+    model, train, steps = make("SparsePolicy", dict(SPARSE))
+    train()
+    start = time.perf_counter()
+    train()
+    step = (time.perf_counter() - start) / steps
+    plan = SparsityCallback("rigl", update_interval=1, drop_fraction=0.5).plan
+    sparse = model.policy.sparse
+    moving = []
+    for _ in range(3):
+        sparse.plan = plan
+        start = time.perf_counter()
+        train()
+        moving.append((time.perf_counter() - start) / steps - step)
+        sparse.plan = None
+    return median(moving), interval * step
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--rounds", type=int, default=21, help="rounds of each case (default 21)")
+    parser.add_argument("--cases", default="", help="only the cases that contain this text")
+    parser.add_argument("--skip-update", action="store_true", help="leave out the 4096-wide update")
+    args = parser.parse_args()
+    th.set_num_threads(1)
+    print(f"torch {th.__version__}, 1 thread, {SPARSITY:.0%} ERK, median of {args.rounds} rounds\n")
+    print("| case | variant | ms a step | ratio to stock | ratio to dense fused | target |")
+    print("|---|---|---|---|---|---|")
+    for name in [name for name in CASES if args.cases in name]:
+        results = time_case(name, args.rounds)
+        fused = results["dense, fused Adam"][1]
+        for variant, (milliseconds, ratio) in results.items():
+            target = f"≤ {CASES[name][2]}" if variant == "masked, fused Adam" else ""
+            print(
+                f"| {name} | {variant} | {milliseconds:.2f} | {ratio:.3f} | {ratio / fused:.3f} "
+                f"| {target} |",
+                flush=True,
+            )
+    if not args.skip_update:
+        update, steps = time_topology_update(4096, 1000)
+        print(
+            f"\nRigL update, DQN 4096x4096: {update:.2f} s; 1000 gradient steps (batch 256): "
+            f"{steps:.0f} s; share {update / (update + steps):.2%} (target < 1 %)"
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,74 @@
+"""The command line: ``sb3-sparse train`` and ``sb3-sparse inspect``."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+from sb3_sparse.errors import MissingExtra, SparsityError
+
+try:
+    import typer
+    from rich.console import Console
+except ImportError:
+    sys.exit(str(MissingExtra("the command line", "zoo")))
+
+from sb3_sparse.zoo.inspect import inspect_model
+from sb3_sparse.zoo.progress import TrainingProgress
+from sb3_sparse.zoo.train import Run, reached_sparsity
+from sb3_sparse.zoo.train import train as train_run
+
+app = typer.Typer(
+    add_completion=False, no_args_is_help=True, help="Sparse training inside Stable-Baselines3."
+)
+console = Console(highlight=False)
+
+
+@app.command()
+def train(
+    algo: Annotated[str, typer.Option(help="Algorithm: dqn, sac, ppo, a2c, td3, ...")] = "dqn",
+    env: Annotated[str, typer.Option(help="Gymnasium environment id.")] = "CartPole-v1",
+    method: Annotated[str, typer.Option(help="dense, static, set, rigl or prune.")] = "rigl",
+    sparsity: Annotated[float, typer.Option(help="Removed fraction, in [0, 1).")] = 0.9,
+    distribution: Annotated[str, typer.Option(help="erk, er or uniform.")] = "erk",
+    n_timesteps: Annotated[
+        int | None,
+        typer.Option("--n-timesteps", "-n", help="Environment steps [default: as tuned]."),
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Seed of everything.")] = 0,
+    log_folder: Annotated[
+        Path, typer.Option("--log-folder", "-f", help="Where the run's folder is made.")
+    ] = Path("logs"),
+) -> None:
+    """Train, evaluate and save a sparse policy. Without arguments: DQN, RigL, 90 %, CartPole-v1."""
+    run = Run(algo, env, method, sparsity, distribution, seed, n_timesteps)
+    sparse = "" if method == "dense" else f" at {sparsity:.0%} ({distribution.upper()})"
+    console.print(f"Training {algo.upper()} on {env}, {method}{sparse}, seed {seed}")
+    model, result = train_run(run, log_folder, [TrainingProgress(console)])
+    reached = reached_sparsity(model)
+    console.print(
+        f"Return over {result.episodes} episodes: "
+        f"[bold]{result.mean_return:.1f} ± {result.std_return:.1f}[/bold]"
+        + ("" if reached is None else f", sparsity {reached:.2%}")
+    )
+    console.print(f"Model: {result.path}", soft_wrap=True)
+    if reached is not None:
+        console.print(f"Layer by layer: sb3-sparse inspect {result.path}", soft_wrap=True)
+
+
+@app.command()
+def inspect(
+    model: Annotated[Path, typer.Argument(help="A model saved by SB3 (.zip).")],
+) -> None:
+    """Print shape, nnz, density and FLOPs of every layer of a saved sparse model."""
+    console.print(str(inspect_model(model)), soft_wrap=True)
+
+
+def main() -> None:
+    """Run the command line; an error of ours is one line on stderr and exit code 2."""
+    try:
+        app()
+    except SparsityError as error:
+        Console(stderr=True, highlight=False).print(f"Error: {error}", markup=False, soft_wrap=True)
+        sys.exit(2)
