@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.distributions import Distribution
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import Schedule
@@ -95,6 +97,17 @@ class SparsePolicyMixin(BasePolicy):
         self.sparse = Controller(networks, seed, self.functional_gradients)
         self.sparse.attach()
 
+    def __deepcopy__(self: Sparse, memo: dict[int, Any]) -> Sparse:
+        # What an action distribution remembers of the last minibatch hangs on that graph, which
+        # torch refuses to copy. Every forward pass makes it anew, so it can be cut off.
+        for module in self.modules():
+            if isinstance(vars(module).get("action_dist"), Distribution):
+                module.action_dist = _without_graph(module.action_dist)
+        twin = type(self).__new__(type(self))
+        memo[id(self)] = twin
+        twin.__dict__.update(copy.deepcopy(self.__dict__, memo))
+        return twin
+
     def _initial_gain(self, layer_name: str) -> float:
         """Gain with which SB3 initialises the layer, relative to its default."""
         return 1.0
@@ -167,6 +180,17 @@ class SparsePolicyMixin(BasePolicy):
         if hasattr(self, "share_features_extractor"):  # SB3 forgets it for some of its policies
             data["share_features_extractor"] = self.share_features_extractor
         return data
+
+
+def _without_graph(action_dist: Any) -> Distribution:
+    """A copy of SB3's action distribution that holds no graph."""
+    twin: Distribution = copy.copy(action_dist)
+    for name, value in vars(twin).items():
+        if isinstance(value, th.Tensor):
+            setattr(twin, name, value.detach())
+        elif name in ("distribution", "weights_dist"):
+            setattr(twin, name, None)
+    return twin
 
 
 def with_extractor(

@@ -1,0 +1,56 @@
+"""With sparsity 0 training is stock SB3's, number for number."""
+
+from __future__ import annotations
+
+import pytest
+from stable_baselines3.common.logger import KVWriter, Logger
+from support import make
+
+
+class Recorder(KVWriter):
+    """Keeps what is logged."""
+
+    def __init__(self) -> None:
+        self.rows: list[dict[str, object]] = []
+
+    def write(self, key_values, key_excluded, step=0) -> None:
+        self.rows.append(
+            {k: v for k, v in key_values.items() if k not in ("time/fps", "time/time_elapsed")}
+        )
+
+    def close(self) -> None:
+        pass
+
+
+def logged(model, steps: int) -> list[dict[str, object]]:
+    recorder = Recorder()
+    model.set_logger(Logger(folder=None, output_formats=[recorder]))
+    model.learn(steps, log_interval=1)
+    return recorder.rows
+
+
+@pytest.mark.parametrize("fused", [True, False])
+@pytest.mark.parametrize(("name", "steps"), [("DQN", 400), ("SAC", 450), ("PPO", 400)])
+def test_losses_returns_and_weights_equal_those_of_stock_sb3(name, steps, fused):
+    dense = make(name, policy="MlpPolicy")
+    optimizer_kwargs = dict(dense.policy.optimizer_kwargs, fused=fused)
+    dense = make(name, policy="MlpPolicy", policy_kwargs=dict(optimizer_kwargs=optimizer_kwargs))
+    rows = logged(dense, steps)
+    sparse = make(name, policy_kwargs=dict(sparsity=0.0, optimizer_kwargs=dict(optimizer_kwargs)))
+    assert rows == logged(sparse, steps)
+    assert any(key.startswith("train/") and "loss" in key for row in rows for key in row)
+    assert any("rollout/ep_rew_mean" in row for row in rows)
+    ours = dict(sparse.policy.named_parameters())
+    for key, value in dense.policy.named_parameters():
+        assert (ours[key] == value).all(), key
+
+
+def test_a_stock_policy_and_a_sparse_one_draw_the_same_global_random_numbers():
+    import numpy as np
+    import torch as th
+
+    def state_after(policy: str, **kwargs: float) -> tuple[float, float]:
+        make("SAC", policy=policy, policy_kwargs=kwargs)
+        return float(np.random.rand()), float(th.rand(()))
+
+    assert state_after("MlpPolicy") == state_after("SparsePolicy", sparsity=0.9)
