@@ -31,7 +31,17 @@ RESULTS = Path(__file__).parent.parent / "docs" / "results"
 TASKS = {"ppo": "CartPole-v1", "dqn": "CartPole-v1", "sac": "Pendulum-v1"}
 METHODS = ("dense", "static", "set", "rigl", "prune")
 BARS = {"CartPole-v1": 450.0, "Pendulum-v1": -250.0}
-FIELDS = ("algo", "env", "method", "seed", "sparsity", "steps", "mean_return", "std_return", "seconds")
+FIELDS = (
+    "algo",
+    "env",
+    "method",
+    "seed",
+    "sparsity",
+    "steps",
+    "mean_return",
+    "std_return",
+    "seconds",
+)
 EPISODES = 50
 
 

@@ -19,8 +19,8 @@ class SparsityCallback(BaseCallback):
     it masks stay as they are, which is static sparse training.
 
     Logged: ``sparsity/total``, ``sparsity/<network>``, ``sparsity/nnz``, ``sparsity/mask_updates``,
-    ``sparsity/mask_churn`` (share of the active connections exchanged or pruned by the last update)
-    and ``sparsity/drop_fraction``.
+    ``sparsity/mask_churn`` (share of the active connections that the last update dropped) and
+    ``sparsity/drop_fraction``.
 
     :param method: ``"static"``, ``"set"``, ``"rigl"``, ``"prune"`` or a registered one
     :param update_interval: gradient steps of a network's own optimizer between two updates
@@ -33,8 +33,8 @@ class SparsityCallback(BaseCallback):
     :param update_on: ``"step"``: at the gradient step that is due (default); ``"rollout"``: at the
         start of the next rollout
     :param verbose: as in SB3
-    :raises ConfigError: for an unknown method, a value that is not allowed or an argument that means
-        nothing for the method
+    :raises ConfigError: for an unknown method, a value that is not allowed or an argument that
+        means nothing for the method
 
     Source: arXiv:2206.10369, sections 2.1 and A.3.
     """
@@ -72,7 +72,8 @@ class SparsityCallback(BaseCallback):
         policy = self.model.policy
         if not isinstance(policy, SparsePolicyMixin):
             raise ConfigError(
-                f"SparsityCallback needs a sparse policy, got {type(policy).__name__}; make the model "
+                f"SparsityCallback needs a sparse policy, got {type(policy).__name__}; make the "
+                "model "
                 'with SparsePolicy, e.g. SAC("SparsePolicy", env, policy_kwargs=dict(sparsity=0.9))'
             )
         return policy
@@ -88,9 +89,9 @@ class SparsityCallback(BaseCallback):
             )
         if not self.plan.topology.reaches_final and denser:
             raise ConfigError(
-                f"the policy starts at initial_sparsity={policy.sparsity_config.initial_sparsity}, and "
-                f"method {self.plan.method!r} would never take it to its sparsity; use 'prune', or "
-                "leave initial_sparsity out"
+                f"the policy starts at initial_sparsity={policy.sparsity_config.initial_sparsity}, "
+                f"and method {self.plan.method!r} would never take it to its sparsity; use "
+                "'prune', or leave initial_sparsity out"
             )
         policy.sparse.plan = None  # of a run that was interrupted
 

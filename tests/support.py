@@ -1,10 +1,9 @@
-"""What all tests share: small models and environments, and a method that a user might have written."""
+"""What all tests share: small models and environments, and a method as a user might write it."""
 
 from __future__ import annotations
 
 import gymnasium as gym
 import numpy as np
-import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 
@@ -111,4 +110,3 @@ def assert_masked(model: BaseAlgorithm) -> None:
             for key, value in optimizer.state.get(layer.weight, {}).items():
                 if value.shape == layer.weight.shape:
                     assert not value[inactive].any(), (layer.name, key)
-

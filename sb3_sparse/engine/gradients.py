@@ -2,8 +2,9 @@
 
 Two kinds of algorithm, two hooks:
 
-- Most call ``backward()``, perhaps on other losses too (SAC's actor loss fills the critics' gradients
-  after their step). The last gradient before the owning optimizer's step is the one it applies.
+- Most call ``backward()``, perhaps on other losses too (SAC's actor loss fills the critics'
+  gradients after their step). The last gradient before the owning optimizer's step is the one it
+  applies.
 - TRPO takes the actor's gradient with ``torch.autograd.grad``, which only a tensor hook sees: first
   with a graph (of the KL divergence), then the plain one of the objective, then Hessian products.
   The first plain gradient is the one wanted. Masked there, conjugate gradients and line search work
@@ -45,7 +46,9 @@ class AccumulatedGradient(GradientMask):
     """For algorithms that call ``backward()``."""
 
     def attach(self) -> RemovableHandle:
-        return self.layer.weight.register_post_accumulate_grad_hook(self._hook)
+        weight = self.layer.weight
+        handle: RemovableHandle = weight.register_post_accumulate_grad_hook(self._hook)  # type: ignore[no-untyped-call]
+        return handle
 
     def _hook(self, weight: th.Tensor) -> None:
         layer = self.layer
@@ -66,7 +69,7 @@ class FunctionalGradient(GradientMask):
     """For algorithms that also use ``torch.autograd.grad``."""
 
     def attach(self) -> RemovableHandle:
-        handle: RemovableHandle = self.layer.weight.register_hook(self._hook)
+        handle: RemovableHandle = self.layer.weight.register_hook(self._hook)  # type: ignore[no-untyped-call]
         return handle
 
     def _hook(self, grad: th.Tensor) -> th.Tensor | None:

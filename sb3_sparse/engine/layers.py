@@ -27,9 +27,9 @@ def _ignore_mask_key(
 class MaskedLayer:
     """A layer stored as its dense weight, 0 where inactive, and a boolean mask.
 
-    The mask is the buffer ``weight_mask`` of the module and so rides in its state_dict; a float copy
-    that does not is what gradients are multiplied with. Whenever a state_dict is loaded, at any
-    level, the weight is masked again.
+    The mask is the buffer ``weight_mask`` of the module and so rides in its state_dict; a float
+    copy that does not is what gradients are multiplied with. Whenever a state_dict is loaded, at
+    any level, the weight is masked again.
 
     :param name: dotted name within the policy
     :param module: the Linear or Conv layer; it stays in place
@@ -48,12 +48,14 @@ class MaskedLayer:
         ones = th.ones_like(module.weight, requires_grad=False)
         module.register_buffer(MASK_KEY, ones.bool())
         module.register_buffer(FLOAT_MASK_KEY, ones, persistent=False)
-        module.register_load_state_dict_post_hook(self._after_load)
+        module.register_load_state_dict_post_hook(self._after_load)  # type: ignore[no-untyped-call]
 
     @property
     def weight(self) -> nn.Parameter:
         """The parameter that the optimizer moves."""
-        return self.module.weight
+        weight = self.module.weight
+        assert isinstance(weight, nn.Parameter)
+        return weight
 
     @property
     def full(self) -> bool:
@@ -81,7 +83,7 @@ class MaskedLayer:
     def add_target(self, module: Kernel) -> None:
         """Make ``module`` a target copy of this layer; it takes the weights that the layer has."""
         self.targets.append(module)
-        module.register_load_state_dict_pre_hook(_ignore_mask_key)
+        module.register_load_state_dict_pre_hook(_ignore_mask_key)  # type: ignore[no-untyped-call]
         self.sync_targets()
 
     def sync_targets(self) -> None:
@@ -143,8 +145,8 @@ class MaskedLayer:
         ):
             raise TopologyError(
                 f"the exchange for {self.name} drops {dropped.size} and grows {grown.size} of "
-                f"{self.nnz} connections, but some of the dropped are not active, some of the grown "
-                "are, an index stands twice, or no connection would be left"
+                f"{self.nnz} connections, but some of the dropped are not active, some of the "
+                "grown are, an index stands twice, or no connection would be left"
             )
         before = self.float_mask.clone()
         self.set_mask(after)

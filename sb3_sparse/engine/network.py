@@ -54,6 +54,10 @@ class SparseNetwork:
         assert isinstance(optimizer, th.optim.Optimizer)
         return optimizer
 
+    @optimizer.setter
+    def optimizer(self, optimizer: th.optim.Optimizer) -> None:
+        setattr(self.owner, "optimizer", optimizer)  # noqa: B010  (nn.Module types no such attribute)
+
     @property
     def size(self) -> int:
         """Connections of the dense network, within the budget."""

@@ -6,7 +6,6 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 import torch as th
-from torch import nn
 
 from sb3_sparse.errors import ConfigError
 
@@ -33,7 +32,7 @@ def check_weight_decay(weight_decay: float, optimizer_kwargs: Mapping[str, Any] 
 def rebuild(
     optimizer: th.optim.Optimizer,
     optimizer_kwargs: Mapping[str, Any],
-    kernels: Iterable[nn.Parameter],
+    kernels: Iterable[th.Tensor],
     weight_decay: float,
 ) -> th.optim.Optimizer:
     """The same optimizer, before its first step, fused and with weight decay on kernels only.

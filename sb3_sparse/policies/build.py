@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING
 
+import torch as th
 from torch import nn
 
 from sb3_sparse.engine.kernels import KERNEL_TYPES, find_kernels
@@ -45,7 +46,10 @@ def build_networks(
     found = _find_layers(policy, modules, specs, config)
     networks = [
         SparseNetwork(
-            name, modules[specs[name].owner], kernels=found[name].sparse, dense_kernels=found[name].dense
+            name,
+            modules[specs[name].owner],
+            kernels=found[name].sparse,
+            dense_kernels=found[name].dense,
         )
         for name in specs
     ]
@@ -53,7 +57,8 @@ def build_networks(
     for name, size in sizes.items():
         if size == 0:
             raise ConfigError(
-                f"dense_layers={list(config.dense_layers)} leaves nothing to make sparse in {name!r}"
+                f"dense_layers={list(config.dense_layers)} leaves nothing to make sparse in "
+                f"{name!r}"
             )
     sparsities = config.by_network(sizes)
     for network in networks:
@@ -70,7 +75,7 @@ def build_networks(
     return networks
 
 
-def kernel_parameters(networks: Iterable[SparseNetwork]) -> list[nn.Parameter]:
+def kernel_parameters(networks: Iterable[SparseNetwork]) -> list[th.Tensor]:
     """Weights of all Linear and Conv layers, the dense ones too."""
     return [
         parameter
@@ -118,8 +123,8 @@ def _find_layers(
     if unmatched:
         names = [name for kernels in found.values() for name, _ in kernels.sparse + kernels.dense]
         raise ConfigError(
-            f"dense_layers has {', '.join(map(repr, sorted(unmatched)))}, which is no layer of this "
-            f"policy; its layers are {', '.join(names)}, or use the words 'input' and 'output'"
+            f"dense_layers has {', '.join(map(repr, sorted(unmatched)))}, which is no layer of "
+            f"this policy; its layers are {', '.join(names)}, or use the words 'input' and 'output'"
         )
     return found
 
@@ -129,7 +134,7 @@ def _add_targets(
     specs: Mapping[str, NetworkSpec],
     networks: Iterable[SparseNetwork],
 ) -> None:
-    """Give every layer its copies in the target networks, found by the same name below the target."""
+    """Give every layer its copies in the target networks, which have the same names there."""
     layers = {id(layer.weight): layer for network in networks for layer in network.layers}
     done: set[int] = set()
     for spec in specs.values():

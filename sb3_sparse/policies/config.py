@@ -10,8 +10,9 @@ from sb3_sparse.sparsity.budgets import split_sparsity
 from sb3_sparse.sparsity.distributions import check_distribution, check_sparsity
 
 SPARSITY_MISSING = (
-    "a sparse policy needs its sparsity, e.g. policy_kwargs=dict(sparsity=0.9): the removed fraction "
-    "of connections, in [0, 1). There is no default, so that a lost value cannot train dense"
+    "a sparse policy needs its sparsity, e.g. policy_kwargs=dict(sparsity=0.9): the removed "
+    "fraction of connections, in [0, 1). There is no default, so that a lost value cannot train "
+    "dense"
 )
 
 
@@ -50,8 +51,8 @@ class SparsityConfig:
                 check_sparsity(value, f"sparsity of {name!r}")
             if self.actor_share is not None:
                 raise ConfigError(
-                    "sparsity is given for each network and actor_share as well; give one number as "
-                    "sparsity to have it shared out"
+                    "sparsity is given for each network and actor_share as well; give one number "
+                    "as sparsity to have it shared out"
                 )
         else:
             check_sparsity(self.sparsity)
@@ -84,16 +85,14 @@ class SparsityConfig:
         if isinstance(self.sparsity, Mapping):
             if set(self.sparsity) != set(sizes):
                 raise ConfigError(
-                    f"sparsity is given for {', '.join(repr(n) for n in self.sparsity)}; this policy "
-                    f"has the networks {names}: name each of them, or give one number"
+                    f"sparsity is given for {', '.join(repr(n) for n in self.sparsity)}; this "
+                    f"policy has the networks {names}: name each of them, or give one number"
                 )
             return {name: float(self.sparsity[name]) for name in sizes}
         if self.actor_share is None:
             return {name: float(self.sparsity) for name in sizes}
         if set(sizes) != {"actor", "critic"}:
-            raise ConfigError(
-                f"actor_share needs an actor and a critic; this policy has {names}"
-            )
+            raise ConfigError(f"actor_share needs an actor and a critic; this policy has {names}")
         actor, critic = split_sparsity(
             sizes["actor"], sizes["critic"], self.sparsity, self.actor_share
         )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.torch_layers import (
@@ -17,7 +19,7 @@ SUPPORTED = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBina
 
 
 def choose_extractor(
-    observation_space: spaces.Space, normalize_images: bool
+    observation_space: spaces.Space[Any], normalize_images: bool
 ) -> type[BaseFeaturesExtractor]:
     """NatureCNN for images, CombinedExtractor for dicts, else flat.
 
@@ -25,8 +27,8 @@ def choose_extractor(
     """
     if not isinstance(observation_space, SUPPORTED):
         raise UnsupportedError(
-            f"observations of type {type(observation_space).__name__} are not supported; allowed are "
-            f"{', '.join(space.__name__ for space in SUPPORTED)}"
+            f"observations of type {type(observation_space).__name__} are not supported; allowed "
+            f"are {', '.join(space.__name__ for space in SUPPORTED)}"
         )
     if isinstance(observation_space, spaces.Dict):
         return CombinedExtractor

@@ -36,7 +36,8 @@ class SparsePolicyMixin(BasePolicy):
         network, e.g. ``{"actor": 0.95, "critic": 0.8}``; required
     :param initial_sparsity: what training starts with; None: the same; 0.0 for pruning
     :param distribution: ``"erk"``, ``"er"`` or ``"uniform"``
-    :param actor_share: fraction of all remaining connections that the actor gets; None: equally sparse
+    :param actor_share: fraction of all remaining connections that the actor gets; None: equally
+        sparse
     :param dense_layers: layers left dense, by name pattern or the words ``"input"``, ``"output"``
     :param sparsity_aware_init: draw the weights by the fans that are there
     :param weight_decay: coupled L2 on kernels only
@@ -57,8 +58,8 @@ class SparsePolicyMixin(BasePolicy):
 
     def __init__(
         self,
-        observation_space: spaces.Space,
-        action_space: spaces.Space,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Space[Any],
         lr_schedule: Schedule,
         *,
         sparsity: float | Mapping[str, float] | None = None,
@@ -90,9 +91,10 @@ class SparsePolicyMixin(BasePolicy):
         self.weight_decay = weight_decay
         seed = th.initial_seed() % 2**63 if mask_seed is None else mask_seed
         networks = build_networks(self, self.networks, config, seed, self._initial_gain)
-        for owner in {id(n.owner): n.owner for n in networks}.values():
-            owner.optimizer = rebuild(
-                owner.optimizer, self.optimizer_kwargs, kernel_parameters(networks), weight_decay
+        kernels = kernel_parameters(networks)
+        for network in {id(network.owner): network for network in networks}.values():
+            network.optimizer = rebuild(
+                network.optimizer, self.optimizer_kwargs, kernels, weight_decay
             )
         self.sparse = Controller(networks, seed, self.functional_gradients)
         self.sparse.attach()
@@ -101,8 +103,8 @@ class SparsePolicyMixin(BasePolicy):
         # What an action distribution remembers of the last minibatch hangs on that graph, which
         # torch refuses to copy. Every forward pass makes it anew, so it can be cut off.
         for module in self.modules():
-            if isinstance(vars(module).get("action_dist"), Distribution):
-                module.action_dist = _without_graph(module.action_dist)
+            if "action_dist" in vars(module):
+                vars(module)["action_dist"] = _without_graph(vars(module)["action_dist"])
         twin = type(self).__new__(type(self))
         memo[id(self)] = twin
         twin.__dict__.update(copy.deepcopy(self.__dict__, memo))
@@ -117,7 +119,7 @@ class SparsePolicyMixin(BasePolicy):
         return report_on(self)
 
     def set_training_mode(self, mode: bool) -> None:
-        """As in SB3. Every ``train()`` calls it first, so a copied policy gets its hooks back here."""
+        """As in SB3. Every ``train()`` calls it first: here a copied policy gets its hooks back."""
         super().set_training_mode(mode)
         if mode:
             self.sparse.begin_training()
@@ -153,11 +155,15 @@ class SparsePolicyMixin(BasePolicy):
         """
         networks = self.sparse.networks
         expected = 1 + 2 * len(networks)
-        if not isinstance(state, th.Tensor) or state.shape != (expected,) or bool((state < 0).any()):
+        if (
+            not isinstance(state, th.Tensor)
+            or state.shape != (expected,)
+            or bool((state < 0).any())
+        ):
             raise CorruptStateError(
-                f"the saved sparsity state must be {expected} numbers, 0 or more (seed, and clock and "
-                f"updates of {', '.join(n.name for n in networks)}), got {state!r}; the file is "
-                "damaged or belongs to a policy of another kind"
+                f"the saved sparsity state must be {expected} numbers, 0 or more (seed, and clock "
+                f"and updates of {', '.join(n.name for n in networks)}), got {state!r}; the file "
+                "is damaged or belongs to a policy of another kind"
             )
         seed, *numbers = state.tolist()
         self.sparse.seed = int(seed)
@@ -198,8 +204,8 @@ def with_extractor(
 ) -> type[Sparse]:
     """A subclass of ``policy`` with another default features extractor.
 
-    :param prefix: what to put between the class name and ``Policy``, e.g. ``"Cnn"``; the module must
-        bind the class to that name, or it cannot be pickled
+    :param prefix: what to put between the class name and ``Policy``, e.g. ``"Cnn"``; the module
+        must bind the class to that name, or it cannot be pickled
     """
     name = policy.__name__.removesuffix("Policy") + prefix + "Policy"
     members = {

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch as th
@@ -119,7 +119,9 @@ def report_on(policy: SparsePolicyMixin) -> SparsityReport:
         kernels: list[tuple[str, Kernel, int, bool]] = [
             (layer.name, layer.module, layer.nnz, True) for layer in network.layers
         ]
-        kernels += [(n, module, module.weight.numel(), False) for n, module in network.dense_kernels]
+        kernels += [
+            (n, module, module.weight.numel(), False) for n, module in network.dense_kernels
+        ]
         for name, module, nnz, in_budget in kernels:
             biases = 0 if module.bias is None else module.bias.numel()
             units = module.weight.shape[0] if id(module) in activated else 0
@@ -178,7 +180,7 @@ def _conv_positions(policy: SparsePolicyMixin) -> dict[int, int]:
     return positions
 
 
-def _zeros(space: spaces.Space, device: th.device) -> th.Tensor | dict[str, th.Tensor]:
+def _zeros(space: spaces.Space[Any], device: th.device) -> th.Tensor | dict[str, th.Tensor]:
     if isinstance(space, spaces.Dict):
         parts = {key: _zeros(part, device) for key, part in space.spaces.items()}
         return {key: part for key, part in parts.items() if isinstance(part, th.Tensor)}

@@ -18,8 +18,8 @@ DENSE_WORDS = ("input", "output")
 class NetworkSpec:
     """One network of a policy, by dotted module names (``fnmatch`` patterns where several match).
 
-    :param roots: modules whose layers belong to the network; one that an earlier network has already
-        (a shared features extractor) stays with that one
+    :param roots: modules whose layers belong to the network; one that an earlier network has
+        already (a shared features extractor) stays with that one
     :param trunks: modules whose first layer reads features
     :param heads: modules whose last layer is an output
     :param target: target copy of the one root, if there is one

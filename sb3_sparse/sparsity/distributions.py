@@ -57,9 +57,7 @@ def _erdos_renyi(
         epsilon = budget / sum(scores[i] * sizes[i] for i in free)
         largest = max(scores[i] for i in free)
         if epsilon * largest <= 1.0:
-            return [
-                0.0 if i in dense else 1.0 - epsilon * scores[i] for i in range(len(shapes))
-            ]
+            return [0.0 if i in dense else 1.0 - epsilon * scores[i] for i in range(len(shapes))]
         dense.update(i for i in free if scores[i] == largest)
     return [0.0] * len(shapes)
 
@@ -84,16 +82,14 @@ def check_distribution(distribution: str) -> str:
 
     :raises ConfigError: if there is none of that name
     """
-    if distribution not in DISTRIBUTIONS:
+    if not isinstance(distribution, str) or distribution not in DISTRIBUTIONS:
         raise ConfigError(
             f"unknown distribution {distribution!r}; allowed are {', '.join(sorted(DISTRIBUTIONS))}"
         )
     return distribution
 
 
-def active_counts(
-    shapes: Sequence[Shape], sparsity: float, distribution: str = "erk"
-) -> list[int]:
+def active_counts(shapes: Sequence[Shape], sparsity: float, distribution: str = "erk") -> list[int]:
     """Number of active connections of each layer of one network.
 
     The number of zeros in a layer is exactly ``floor(s_l * N_l)``, and a layer keeps at least one
@@ -113,7 +109,8 @@ def active_counts(
     for shape in shapes:
         if len(shape) < 2 or any(dim < 1 for dim in shape):
             raise ConfigError(
-                f"a weight shape needs two or more positive dimensions (out, in, ...), got {shape!r}"
+                f"a weight shape needs two or more positive dimensions (out, in, ...), got "
+                f"{shape!r}"
             )
     layer_sparsities = DISTRIBUTIONS[distribution](shapes, sparsity)
     counts = []

@@ -29,8 +29,8 @@ def random_mask(shape: Sequence[int], active: int, seed: int, name: str) -> NDAr
 def glorot_limits(mask: NDArray[np.bool_], gain: float = 1.0) -> NDArray[np.float64]:
     """Bound of the uniform distribution of each connection, by the fans that are really there.
 
-    ``L = gain * sqrt(3 / max(1, (fan_in + fan_out) / 2))`` with the active fan-in of the output unit
-    and the active fan-out of the input unit, for convolutions summed over the window.
+    ``L = gain * sqrt(3 / max(1, (fan_in + fan_out) / 2))`` with the active fan-in of the output
+    unit and the active fan-out of the input unit, for convolutions summed over the window.
 
     :param mask: shape ``(out, in, *kernel)``
     :param gain: factor relative to Glorot's bound

@@ -28,4 +28,5 @@ def random_bits(seed: int, address: str, count: int, number: int = 0) -> NDArray
 def random_uniform(seed: int, address: str, count: int, number: int = 0) -> NDArray[np.float64]:
     """``count`` numbers uniform in [-1, 1); the arguments are those of :func:`random_bits`."""
     bits = random_bits(seed, address, count, number)
-    return (bits >> np.uint64(11)).astype(np.float64) * 2.0**-52 - 1.0
+    uniform: NDArray[np.float64] = (bits >> np.uint64(11)).astype(np.float64) * 2.0**-52 - 1.0
+    return uniform

@@ -1,4 +1,4 @@
-"""Exact selection by score. Ties break towards the lowest index, so a choice never depends on luck."""
+"""Exact selection by score. Ties break towards the lowest index, never by luck."""
 
 from __future__ import annotations
 

@@ -3,7 +3,7 @@
 from sb3_sparse.topology import prune, rigl, static
 from sb3_sparse.topology import set as set_
 from sb3_sparse.topology.base import DropGrow, Exchange, Layer, Moment, TopologyMethod
-from sb3_sparse.topology.registry import method_names, method_named, register
+from sb3_sparse.topology.registry import method_named, method_names, register
 
 __all__ = [
     "DropGrow",

@@ -20,12 +20,17 @@ def register(cls: type[Method]) -> type[Method]:
     if not isinstance(name, str) or not name:
         raise ConfigError(f'{cls.__qualname__} needs a class attribute `name`, e.g. name = "mine"')
     known = _METHODS.get(name)
-    if known is not None and type(known).__qualname__ != cls.__qualname__:
+    if known is not None and _address(type(known)) != _address(cls):
         raise ConfigError(
-            f"the method name {name!r} is taken by {type(known).__qualname__}; choose another"
+            f"the method name {name!r} is taken by {_address(type(known))}; choose another"
         )
     _METHODS[name] = cls()
     return cls
+
+
+def _address(cls: type) -> str:
+    """Where a class is defined; the same when its cell or module is run again."""
+    return f"{cls.__module__}.{cls.__qualname__}"
 
 
 def method_names() -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 from zipfile import BadZipFile
 
 from stable_baselines3.common.save_util import load_from_zip_file
@@ -35,7 +36,8 @@ def load_sparse_policy(path: Path) -> SparsePolicyMixin:
     policy = policy_class(
         data["observation_space"], data["action_space"], policy_class._dummy_schedule, **kwargs
     )
-    policy.load_state_dict(params["policy"])
+    state: Any = params["policy"]
+    policy.load_state_dict(state)
     return policy
 
 

@@ -46,8 +46,7 @@ class TrainingProgress(BaseCallback):
         self.progress.start()
 
     def _status(self) -> str:
-        episodes = self.model.ep_info_buffer or []
-        returns = [float(episode["r"]) for episode in episodes]
+        returns = [float(episode["r"]) for episode in self.model.ep_info_buffer or ()]
         text = f"return {fmean(returns):.1f}" if returns else "return –"
         policy = self.model.policy
         if isinstance(policy, SparsePolicyMixin):

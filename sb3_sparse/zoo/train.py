@@ -51,8 +51,8 @@ class Run:
     def __post_init__(self) -> None:
         if self.algo not in algorithms():
             raise ConfigError(
-                f"unknown algorithm {self.algo!r}; allowed are {', '.join(algorithms())} (tqc, qrdqn, "
-                "crossq and trpo need sb3-sparse[contrib])"
+                f"unknown algorithm {self.algo!r}; allowed are {', '.join(algorithms())} (tqc, "
+                "qrdqn, crossq and trpo need sb3-sparse[contrib])"
             )
         if self.env_id not in gym.registry:
             raise ConfigError(
@@ -129,7 +129,7 @@ def make_model(run: Run, env: VecEnv, **kwargs: Any) -> tuple[BaseAlgorithm, lis
     return model, callbacks
 
 
-def stock_policy(observation_space: spaces.Space) -> str:
+def stock_policy(observation_space: spaces.Space[Any]) -> str:
     """The name of SB3's own policy for these observations."""
     if isinstance(observation_space, spaces.Dict):
         return "MultiInputPolicy"
@@ -145,13 +145,15 @@ def make_env(run: Run) -> VecEnv:
         env = make_vec_env(run.env_id, n_envs=run.settings.n_envs, seed=run.seed)
     except gym.error.DependencyNotInstalled as error:
         raise ConfigError(
-            f"{run.env_id} cannot be made: {error}; MuJoCo tasks need sb3-sparse[mujoco], Atari games "
-            "sb3-sparse[atari]"
+            f"{run.env_id} cannot be made: {error}; MuJoCo tasks need sb3-sparse[mujoco], Atari "
+            "games sb3-sparse[atari]"
         ) from error
     discrete_only = run.algo in ("dqn", "qrdqn")
     box_only = run.algo in ("sac", "td3", "ddpg", "tqc", "crossq")
     discrete = isinstance(env.action_space, spaces.Discrete)
-    if (discrete_only and not discrete) or (box_only and not isinstance(env.action_space, spaces.Box)):
+    if (discrete_only and not discrete) or (
+        box_only and not isinstance(env.action_space, spaces.Box)
+    ):
         raise ConfigError(
             f"{run.algo} cannot act in {run.env_id}, whose actions are {env.action_space}; "
             + (

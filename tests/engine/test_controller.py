@@ -17,8 +17,8 @@ from sb3_sparse.topology import Exchange, TopologyMethod, register
 
 # Active: the first two columns. Least magnitudes: flat 5 (0.1), then 4 (0.2).
 WEIGHTS = [[0.5, -0.6, 0.0, 0.0], [-0.2, 0.1, 0.0, 0.0], [0.7, -0.8, 0.0, 0.0]]
-# Dense gradient. Of the inactive and the two dropped ones (2, 3, 4, 5, 6, 7, 10, 11) the largest are
-# flat 7 (9.0) and flat 4 (8.0), which is one of the dropped: it stays.
+# Dense gradient. Of the inactive and the two dropped ones (2, 3, 4, 5, 6, 7, 10, 11) the largest
+# are flat 7 (9.0) and flat 4 (8.0), which is one of the dropped: it stays.
 GRADIENT = [[1.0, 1.0, 2.0, -3.0], [8.0, 0.5, 0.0, -9.0], [1.0, 1.0, 4.0, 5.0]]
 
 
@@ -33,9 +33,7 @@ def rig(method="rigl", optimizer=None, functional=False, **plan):
     layer.final_nnz = layer.initial_nnz = 6
     controller = Controller([network], seed=1, functional_gradients=functional)
     controller.attach()
-    settings = dict(
-        update_interval=1, drop_fraction=1 / 3, begin=0.0, end=0.8, update_on="step"
-    )
+    settings = dict(update_interval=1, drop_fraction=1 / 3, begin=0.0, end=0.8, update_on="step")
     controller.start(Plan(method, **{**settings, **plan}), soft_targets=True)
     return owner, layer, controller
 

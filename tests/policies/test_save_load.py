@@ -192,7 +192,9 @@ def test_a_fresh_process_needs_no_import_of_the_plugin_to_load(tmp_path):
         f"policy = SAC.load({str(tmp_path / 'model.zip')!r}, device='cpu').policy; "
         "print([layer.nnz for layer in policy.sparse.layers], policy.sparse.networks[0].clock)"
     )
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+    )
     sparse = model.policy.sparse
     expected = f"{[layer.nnz for layer in sparse.layers]} {sparse.networks[0].clock}"
     assert done.stdout.strip() == expected
@@ -260,5 +262,3 @@ def test_every_policy_class_can_be_pickled_by_name():
                 continue
             assert issubclass(policy, SparsePolicyMixin)
             assert pickle.loads(pickle.dumps(policy)) is policy
-
-

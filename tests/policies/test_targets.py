@@ -21,7 +21,9 @@ def test_soft_targets_follow_at_once_dropped_to_zero_and_grown_from_zero():
     model = make("SAC")
     model.learn(40)
     critic = model.policy.sparse.networks[1]
-    before = {layer.name: (layer.mask(), layer.targets[0].weight.clone()) for layer in critic.layers}
+    before = {
+        layer.name: (layer.mask(), layer.targets[0].weight.clone()) for layer in critic.layers
+    }
     move_everything(model, soft=True)
     moved = 0
     for layer in critic.layers:
