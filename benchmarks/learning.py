@@ -28,7 +28,13 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from sb3_sparse.zoo.train import Run, evaluate, make_env, make_model, reached_sparsity
 
 RESULTS = Path(__file__).parent.parent / "docs" / "results"
-TASKS = {"ppo": "CartPole-v1", "dqn": "CartPole-v1", "sac": "Pendulum-v1"}
+TASKS = {
+    "ppo": "CartPole-v1",
+    "dqn": "CartPole-v1",
+    "dqn-constant": "CartPole-v1",  # the RL zoo's learning rate, which does not decay
+    "sac": "Pendulum-v1",
+}
+OVERRIDES = {"dqn-constant": dict(learning_rate=2.3e-3)}
 METHODS = ("dense", "static", "set", "rigl", "prune")
 BARS = {"CartPole-v1": 450.0, "Pendulum-v1": -250.0}
 FIELDS = (
@@ -48,9 +54,10 @@ EPISODES = 50
 def one_run(algo: str, method: str, seed: int) -> dict[str, object]:
     """Train and evaluate; the CSV row."""
     th.set_num_threads(1)
-    run = Run(algo=algo, env_id=TASKS[algo], method=method, seed=seed)
+    name = algo.partition("-")[0]
+    run = Run(algo=name, env_id=TASKS[algo], method=method, seed=seed)
     env = make_env(run)
-    model, callbacks = make_model(run, env)
+    model, callbacks = make_model(run, env, **OVERRIDES.get(algo, {}))
     start = time.perf_counter()
     model.learn(run.steps, callback=callbacks)
     seconds = time.perf_counter() - start

@@ -40,7 +40,7 @@ class Layer(Protocol):
         """Active connections that the requested sparsity leaves the layer."""
 
     def mask(self) -> NDArray[np.bool_]:
-        """True where a connection is active."""
+        """True where a connection is active; a copy, to do with as one likes."""
 
     def dense(self) -> NDArray[np.float32]:
         """The weights, 0 where inactive."""
