@@ -1,7 +1,6 @@
 """How a mask may move: one file a method, one registration each."""
 
-from sb3_sparse.topology import prune, rigl, static
-from sb3_sparse.topology import set as set_
+from sb3_sparse.topology import prune, rigl, set, static  # noqa: A004, F401  (they register)
 from sb3_sparse.topology.base import DropGrow, Exchange, Layer, Moment, TopologyMethod
 from sb3_sparse.topology.registry import method_named, method_names, register
 
@@ -13,9 +12,5 @@ __all__ = [
     "TopologyMethod",
     "method_named",
     "method_names",
-    "prune",
     "register",
-    "rigl",
-    "set_",
-    "static",
 ]

@@ -24,6 +24,10 @@ class Layer(Protocol):
         """Dotted name within the policy."""
 
     @property
+    def shape(self) -> tuple[int, ...]:
+        """The weight's shape, ``(out, in, *kernel)``."""
+
+    @property
     def size(self) -> int:
         """Connections of the dense layer."""
 

@@ -1,0 +1,73 @@
+"""The report, against numbers worked out by hand."""
+
+from __future__ import annotations
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from support import make
+
+
+class Frames(gym.Env):
+    """Atari-sized frames, channels first."""
+
+    observation_space = spaces.Box(0, 255, (4, 84, 84), np.uint8)
+    action_space = spaces.Discrete(6)
+
+    def reset(self, *, seed=None, options=None):
+        return self.observation_space.sample(), {}
+
+    def step(self, action):
+        return self.observation_space.sample(), 0.0, False, False, {}
+
+
+def test_flops_of_the_nature_cnn_by_hand():
+    model = make("DQN", Frames(), policy_kwargs=dict(sparsity=0.0, net_arch=[]))
+    rows = {row.name.split("q_net.")[-1]: row for row in model.policy.sparsity_report().layers}
+    # positions * (2 * kernel + biases + activations), without padding: 20x20, 9x9, 7x7 positions.
+    by_hand = {
+        "features_extractor.cnn.0": 400 * (2 * 8 * 8 * 4 * 32 + 32 + 32),
+        "features_extractor.cnn.2": 81 * (2 * 4 * 4 * 32 * 64 + 64 + 64),
+        "features_extractor.cnn.4": 49 * (2 * 3 * 3 * 64 * 64 + 64 + 64),
+        "features_extractor.linear.0": 2 * 3136 * 512 + 512 + 512,
+        "0": 2 * 512 * 6 + 6,  # no activation behind the output
+    }
+    assert {name: row.flops for name, row in rows.items()} == by_hand
+    parameters = (8192 + 32) + (32768 + 64) + (36864 + 64) + (3136 * 512 + 512) + (512 * 6 + 6)
+    assert model.policy.sparsity_report().parameters == parameters
+
+
+def test_sparse_flops_are_those_of_the_active_connections_at_every_position():
+    model = make("DQN", Frames(), policy_kwargs=dict(sparsity=0.9, net_arch=[]))
+    first, *_ = model.policy.sparsity_report().layers
+    active = int(model.policy.q_net.features_extractor.cnn[0].weight_mask.sum())
+    assert first.nnz == active
+    assert first.flops == 400 * (2 * active + 64)
+    assert first.dense_flops == 400 * (2 * 8192 + 64)
+
+
+def test_the_table_names_every_layer_and_the_totals():
+    model = make("SAC", policy_kwargs=dict(sparsity=0.5, dense_layers=["actor.mu"]))
+    report = model.policy.sparsity_report()
+    table = str(report)
+    for row in report.layers:
+        assert row.name in table
+    assert "actor.mu           1x24" in table.replace("  actor", "actor")
+    # Actor 3-24-24-(1+1) without mu: 72 + 576 + 24; critics 2 (4-24-24-1): 2 (96 + 576 + 24).
+    size = 672 + 2 * 696
+    nnz = sum(row.nnz for row in report.layers if row.in_budget)
+    assert report.sparsity() == pytest.approx(1 - nnz / size)
+    assert abs(nnz - size / 2) <= 2 * len(report.layers)
+    biases = 24 + 24 + 1 + 1 + 2 * (24 + 24 + 1)
+    assert report.parameters == nnz + 24 + biases
+    assert f"parameters: {report.parameters:,}" in table
+
+
+def test_a_report_leaves_the_policy_as_it_was():
+    model = make("DQN", gym.make("TinyImages-v0"))
+    model.policy.set_training_mode(True)
+    modes = [module.training for module in model.policy.modules()]
+    model.policy.sparsity_report()
+    assert [module.training for module in model.policy.modules()] == modes
+    assert not any(module._forward_hooks for module in model.policy.modules())

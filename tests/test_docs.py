@@ -1,0 +1,57 @@
+"""What the documents show runs, and what they say is there is there."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+from support import assert_masked, make
+
+from sb3_sparse.topology import registry
+
+ROOT = Path(__file__).parent.parent
+
+
+def python_blocks(path: str) -> list[str]:
+    return re.findall(r"```python\n(.*?)```", (ROOT / path).read_text(), re.DOTALL)
+
+
+def test_the_example_of_the_readme_runs(capsys):
+    (code,) = python_blocks("README.md")
+    small = code.replace("1_000_000", "150").replace("HalfCheetah-v5", "Pendulum-v1")
+    assert small.count("150") == 1
+    exec(compile(small, "README.md", "exec"), {})
+    assert "sparsity: actor 0.9" in capsys.readouterr().out
+
+
+def test_the_method_of_the_documents_trains():
+    (code,) = python_blocks("docs/methods.md")
+    names: dict[str, object] = {"__name__": "docs"}
+    try:
+        exec(compile(code, "docs/methods.md", "exec"), names)
+        model = make("SAC")
+        before = [layer.mask() for layer in model.policy.sparse.layers]
+        model.learn(600, callback=names["callback"])
+        assert any(
+            (layer.mask() != mask).any()
+            for layer, mask in zip(model.policy.sparse.layers, before, strict=True)
+        )
+        assert_masked(model)
+    finally:
+        registry._METHODS.pop("preferential", None)
+
+
+@pytest.mark.parametrize("path", ["README.md", *(f"docs/{p.name}" for p in ROOT.glob("docs/*.md"))])
+def test_links_lead_somewhere(path):
+    text = (ROOT / path).read_text()
+    for target in re.findall(r"\]\(([^)#]+)\)", text):
+        if not target.startswith("http"):
+            assert ((ROOT / path).parent / target).exists(), target
+
+
+def test_the_readme_has_the_command_that_ci_runs():
+    text = (ROOT / "README.md").read_text()
+    (command,) = re.findall(r"<!-- tests -->\n```sh\n(.*)\n```", text)
+    assert "-c constraints.txt" in command
+    assert "pytest" in command
