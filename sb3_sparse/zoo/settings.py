@@ -35,9 +35,7 @@ TUNED: Mapping[tuple[str, str], Settings] = {
     ("dqn", "CartPole-v1"): Settings(
         n_timesteps=50_000,
         algorithm=dict(
-            # The zoo keeps it constant; then the last policy, dense or sparse, is often a bad moment
-            # of an oscillation (docs/learning.md).
-            learning_rate=LinearSchedule(2.3e-3, 0.0, 1.0),
+            learning_rate=2.3e-3,
             batch_size=64,
             buffer_size=100_000,
             learning_starts=1000,
