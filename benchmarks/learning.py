@@ -1,8 +1,8 @@
 """Does every method learn? Real training on small tasks, one CSV row a seed.
 
-Two returns are kept, each the mean of 50 episodes of the deterministic policy: of the last policy, and
-of the best checkpoint of the last fifth of training, chosen by 10 other episodes each (as the RL
-zoo's EvalCallback chooses, but only where masks stand still and pruning is done).
+Two returns are kept, each the mean of 50 episodes of the deterministic policy: of the last policy,
+and of the best checkpoint of the last fifth of training, chosen by 10 other episodes each (as the
+RL zoo's EvalCallback chooses, but only where masks stand still and pruning is done).
 
 A run that is in the CSV already is not run again, so an interrupted benchmark continues.
 
@@ -23,7 +23,6 @@ import time
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import replace
 from pathlib import Path
-from statistics import mean
 
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
@@ -37,18 +36,9 @@ TASKS = {"ppo": "CartPole-v1", "dqn": "CartPole-v1", "sac": "Pendulum-v1"}
 STEPS = {"sac": 10_000}  # half of the RL zoo's 20,000: enough, and two hours shorter
 METHODS = ("dense", "static", "set", "rigl", "prune")
 BARS = {"CartPole-v1": 450.0, "Pendulum-v1": -250.0}
-FIELDS = (
-    "algo",
-    "env",
-    "method",
-    "seed",
-    "sparsity",
-    "steps",
-    "mean_return",
-    "std_return",
-    "seconds",
-)
+FIELDS = ("algo", "env", "method", "seed", "sparsity", "steps", "last", "best", "seconds")
 EPISODES = 50
+CHECKPOINTS = 10
 
 
 class BestCheckpoint(BaseCallback):
