@@ -23,6 +23,7 @@ app = typer.Typer(
     add_completion=False, no_args_is_help=True, help="Sparse training inside Stable-Baselines3."
 )
 console = Console(highlight=False)
+EPISODES = 20
 
 
 @app.command()
@@ -45,16 +46,19 @@ def train(
     run = Run(algo, env, method, sparsity, distribution, seed, n_timesteps)
     sparse = "" if method == "dense" else f" at {sparsity:.0%} ({distribution.upper()})"
     console.print(f"Training {algo.upper()} on {env}, {method}{sparse}, seed {seed}")
-    model, result = train_run(run, log_folder, [TrainingProgress(console)])
+    model, results = train_run(run, log_folder, [TrainingProgress(console)], EPISODES)
     reached = reached_sparsity(model)
-    console.print(
-        f"Return over {result.episodes} episodes: "
-        f"[bold]{result.mean_return:.1f} ± {result.std_return:.1f}[/bold]"
-        + ("" if reached is None else f", sparsity {reached:.2%}")
-    )
-    console.print(f"Model: {result.path}", soft_wrap=True)
     if reached is not None:
-        console.print(f"Layer by layer: sb3-sparse inspect {result.path}", soft_wrap=True)
+        console.print(f"Sparsity {reached:.2%}. Return over {EPISODES} episodes:")
+    else:
+        console.print(f"Return over {EPISODES} episodes:")
+    for result in results:
+        score = f"{result.mean_return:.1f} ± {result.std_return:.1f}"
+        console.print(
+            f"{result.what + ':':<16} [bold]{score}[/bold]  {result.path}", soft_wrap=True
+        )
+    if reached is not None:
+        console.print(f"Layer by layer: sb3-sparse inspect {results[-1].path}", soft_wrap=True)
 
 
 @app.command()

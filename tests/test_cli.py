@@ -21,10 +21,14 @@ def test_train_saves_evaluates_and_says_where_and_inspect_reads_it(tmp_path):
     assert done.returncode == 0, done.stderr
     assert "Training DQN on CartPole-v1, rigl at 90% (ERK), seed 3" in done.stdout
     assert re.search(r"1500 of 1500 steps, return \d+\.\d, sparsity 90\.\d\d%", done.stdout)
-    assert re.search(r"Return over 20 episodes: \d+\.\d ± \d+\.\d, sparsity 90", done.stdout)
-    path = tmp_path / "logs" / "dqn" / "CartPole-v1_1" / "CartPole-v1.zip"
-    assert "Model: logs/dqn/CartPole-v1_1/CartPole-v1.zip" in done.stdout
-    assert DQN.load(path).num_timesteps >= 1500
+    assert "Sparsity 90.00%. Return over 20 episodes:" in done.stdout
+    folder = Path("logs") / "dqn" / "CartPole-v1_1"
+    for what, name in (("Last policy", "CartPole-v1.zip"), ("Best checkpoint", "best_model.zip")):
+        score = r":\s+\d+\.\d ± \d+\.\d  "
+        assert re.search(what + score + re.escape(str(folder / name)), done.stdout)
+    path = tmp_path / folder / "CartPole-v1.zip"
+    assert DQN.load(path).num_timesteps == 1536  # whole rollouts of 256
+    assert 1200 < DQN.load(path.with_name("best_model.zip")).num_timesteps <= 1536
 
     done = sb3_sparse("inspect", str(path), cwd=tmp_path)
     assert done.returncode == 0, done.stderr

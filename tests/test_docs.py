@@ -32,7 +32,7 @@ def test_the_method_of_the_documents_trains():
         exec(compile(code, "docs/methods.md", "exec"), names)
         model = make("SAC")
         before = [layer.mask() for layer in model.policy.sparse.layers]
-        model.learn(700, callback=names["callback"])
+        model.learn(1300, callback=names["callback"])
         assert any(
             (layer.mask() != mask).any()
             for layer, mask in zip(model.policy.sparse.layers, before, strict=True)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
@@ -21,6 +23,7 @@ from sb3_sparse.policies.aliases import SparsePolicy, supported_algorithms
 from sb3_sparse.policies.mixin import SparsePolicyMixin
 from sb3_sparse.sparsity.distributions import check_distribution, check_sparsity
 from sb3_sparse.topology import method_named, method_names
+from sb3_sparse.zoo.checkpoint import BestCheckpoint
 from sb3_sparse.zoo.settings import Settings, settings_for
 
 DENSE = "dense"
@@ -84,15 +87,15 @@ class Run:
 class Result:
     """What came out.
 
+    :param what: which policy of the run
     :param mean_return: mean episode return of the deterministic policy
     :param std_return: its standard deviation over episodes
-    :param episodes: episodes evaluated
     :param path: where the model lies
     """
 
+    what: str
     mean_return: float
     std_return: float
-    episodes: int
     path: Path
 
 
@@ -182,8 +185,8 @@ def train(
     log_folder: Path,
     callbacks: list[BaseCallback],
     episodes: int = 20,
-) -> tuple[BaseAlgorithm, Result]:
-    """Train, save, evaluate.
+) -> tuple[BaseAlgorithm, list[Result]]:
+    """Train, save, evaluate the last policy and the best checkpoint.
 
     The model is saved before it is evaluated, and as far as it came when training is interrupted.
 
@@ -194,17 +197,33 @@ def train(
     """
     env = make_env(run)
     try:
+        use_few_threads(env.observation_space)
         model, own = make_model(run, env)
         folder = new_run_folder(log_folder / run.algo, run.env_id)
         path = folder / f"{run.env_id}.zip"
+        eval_env = make_vec_env(run.env_id, n_envs=1, seed=run.seed + 20_000)
+        best = BestCheckpoint(eval_env, folder)
         try:
-            model.learn(run.steps, callback=[*own, *callbacks])
+            model.learn(run.steps, callback=[*own, *callbacks, best])
         finally:
             model.save(path)
-        mean, std = evaluate(model, run, episodes)
+            eval_env.close()
+        results = [Result("Last policy", *evaluate(model, run, episodes), path)]
+        if best.path.exists():
+            kept = type(model).load(best.path, device=model.device)
+            results.append(Result("Best checkpoint", *evaluate(kept, run, episodes), best.path))
     finally:
         env.close()
-    return model, Result(mean, std, episodes, path)
+    return model, results
+
+
+def use_few_threads(observation_space: spaces.Space[Any]) -> None:
+    """One thread for networks without convolutions, which more threads only slow down.
+
+    ``OMP_NUM_THREADS`` decides where it is set.
+    """
+    if "OMP_NUM_THREADS" not in os.environ and stock_policy(observation_space) == "MlpPolicy":
+        th.set_num_threads(1)
 
 
 def new_run_folder(parent: Path, env_id: str) -> Path:
