@@ -18,19 +18,18 @@ from sb3_sparse.policies.td3 import SparseTD3Policy
 __version__ = version("sb3-sparse")
 __all__ = [
     "SparseActorCriticPolicy",
-    "SparseCrossQPolicy",
     "SparseDQNPolicy",
     "SparsePolicy",
-    "SparseQRDQNPolicy",
     "SparseSACPolicy",
     "SparseTD3Policy",
-    "SparseTQCPolicy",
     "SparsityCallback",
     "supported_algorithms",
 ]
-_CONTRIB = ("SparseCrossQPolicy", "SparseQRDQNPolicy", "SparseTQCPolicy")
+_CONTRIB = ["SparseCrossQPolicy", "SparseQRDQNPolicy", "SparseTQCPolicy"]
 
 register_policies()
+if "TQC" in supported_algorithms():  # sb3-contrib is installed
+    __all__ += _CONTRIB
 
 
 def __getattr__(name: str) -> Any:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_sparse.engine.plan import Plan
@@ -80,27 +82,34 @@ class SparsityCallback(BaseCallback):
 
     def _init_callback(self) -> None:
         policy = self._sparse_policy()
-        networks = policy.sparse.networks
-        denser = any(network.initial_sparsity < network.sparsity for network in networks)
-        if self.plan.topology.reaches_final and not denser:
+        layers = list(policy.sparse.layers)
+        if self.plan.topology.reaches_final and all(
+            layer.initial_nnz == layer.final_nnz for layer in layers
+        ):
             raise ConfigError(
-                f"method {self.plan.method!r} needs a policy that starts denser than it ends: add "
-                "initial_sparsity=0.0 to policy_kwargs"
+                f"method {self.plan.method!r} needs a policy that starts denser than it ends: give "
+                "a sparsity above 0 and initial_sparsity=0.0 in policy_kwargs"
             )
+        denser = any(layer.nnz > layer.final_nnz for layer in layers)
         if not self.plan.topology.reaches_final and denser:
             raise ConfigError(
                 f"the policy starts at initial_sparsity={policy.sparsity_config.initial_sparsity}, "
                 f"and method {self.plan.method!r} would never take it to its sparsity; use "
                 "'prune', or leave initial_sparsity out"
             )
-        policy.sparse.plan = None  # of a run that was interrupted
+        policy.sparse.plan = None  # of a training that was interrupted
 
     def _on_training_start(self) -> None:
         sparse = self._sparse_policy().sparse
         if sparse.plan is not None:
+            sparse.plan = None
             raise ConfigError("two SparsityCallbacks are at work on one model; keep one")
-        tau = getattr(self.model, "tau", 1.0)
-        sparse.start(self.plan, soft_targets=tau < 1.0)
+        model, began = self.model, self.model.start_time  # which every learn() sets anew
+        sparse.start(
+            self.plan,
+            soft_targets=getattr(model, "tau", 1.0) < 1.0,
+            in_force=lambda: model.start_time == began,
+        )
         self._note_progress()
 
     def _on_rollout_start(self) -> None:
@@ -115,12 +124,28 @@ class SparsityCallback(BaseCallback):
 
     def _on_training_end(self) -> None:
         self._note_progress()
-        self._sparse_policy().sparse.stop()
+        sparse = self._sparse_policy().sparse
+        if sparse.plan is None:
+            return  # rl_zoo3 calls this twice
+        sparse.stop()
         self._log()
+        self._warn_if_nothing_was_due()
+
+    def _warn_if_nothing_was_due(self) -> None:
+        sparse = self._sparse_policy().sparse
+        if self.plan.topology.options and sparse.updates_due == 0:
+            warnings.warn(
+                f"{self.plan.method!r} had no mask update, so this was static training: the "
+                f"networks have made {', '.join(str(n.clock) for n in sparse.networks)} gradient "
+                f"steps, and update_interval is {self.plan.update_interval}; train longer or "
+                "choose a smaller one",
+                stacklevel=2,
+            )
 
     def _note_progress(self) -> None:
         planned = self.model._total_timesteps
-        self._sparse_policy().sparse.progress = self.model.num_timesteps / planned
+        progress = self.model.num_timesteps / planned if planned else 1.0
+        self._sparse_policy().sparse.progress = progress
 
     def _log(self) -> None:
         sparse = self._sparse_policy().sparse

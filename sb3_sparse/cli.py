@@ -20,7 +20,10 @@ from sb3_sparse.zoo.train import Run, reached_sparsity
 from sb3_sparse.zoo.train import train as train_run
 
 app = typer.Typer(
-    add_completion=False, no_args_is_help=True, help="Sparse training inside Stable-Baselines3."
+    add_completion=False,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    help="Sparse training inside Stable-Baselines3.",
 )
 console = Console(highlight=False)
 EPISODES = 20
@@ -35,7 +38,7 @@ def train(
     distribution: Annotated[str, typer.Option(help="erk, er or uniform.")] = "erk",
     n_timesteps: Annotated[
         int | None,
-        typer.Option("--n-timesteps", "-n", help="Environment steps [default: as tuned]."),
+        typer.Option("--n-timesteps", "-n", help="Environment steps.", show_default="as tuned"),
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed of everything.")] = 0,
     log_folder: Annotated[
@@ -43,10 +46,14 @@ def train(
     ] = Path("logs"),
 ) -> None:
     """Train, evaluate and save a sparse policy. Without arguments: DQN, RigL, 90 %, CartPole-v1."""
-    run = Run(algo, env, method, sparsity, distribution, seed, n_timesteps)
+    run = Run(algo.lower(), env, method, sparsity, distribution, seed, n_timesteps)
     sparse = "" if method == "dense" else f" at {sparsity:.0%} ({distribution.upper()})"
     console.print(f"Training {algo.upper()} on {env}, {method}{sparse}, seed {seed}")
-    model, results = train_run(run, log_folder, [TrainingProgress(console)], EPISODES)
+    progress = TrainingProgress(console)
+    try:
+        model, results = train_run(run, log_folder, [progress], EPISODES)
+    finally:
+        progress.close()
     reached = reached_sparsity(model)
     if reached is not None:
         console.print(f"Sparsity {reached:.2%}. Return over {EPISODES} episodes:")
@@ -58,7 +65,8 @@ def train(
             f"{result.what + ':':<16} [bold]{score}[/bold]  {result.path}", soft_wrap=True
         )
     if reached is not None:
-        console.print(f"Layer by layer: sb3-sparse inspect {results[-1].path}", soft_wrap=True)
+        console.print("The checkpoint was chosen by other episodes. Layer by layer:")
+        console.print(f"sb3-sparse inspect {results[-1].path}", soft_wrap=True)
 
 
 @app.command()
@@ -70,9 +78,9 @@ def inspect(
 
 
 def main() -> None:
-    """Run the command line; an error of ours is one line on stderr and exit code 2."""
+    """Run the command line; a user's mistake is one line on stderr and exit code 2."""
     try:
-        app()
-    except SparsityError as error:
+        app(standalone_mode=True)
+    except (SparsityError, OSError) as error:
         Console(stderr=True, highlight=False).print(f"Error: {error}", markup=False, soft_wrap=True)
         sys.exit(2)

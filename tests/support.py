@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 import sb3_sparse
-from sb3_sparse.topology import DropGrow, register
+from sb3_sparse.topology import DropGrow, TopologyMethod, register, registry
 
 OFF_POLICY = dict(learning_starts=20, buffer_size=1000, batch_size=16)
 
@@ -21,6 +24,16 @@ class LeastIndex(DropGrow):
 
     def scores(self, layer, moment, candidates, *, dense_grad):
         return -candidates.astype(np.float64)
+
+
+@contextmanager
+def registered(method: type[TopologyMethod]) -> Iterator[None]:
+    """Make a method known for a while."""
+    register(method)
+    try:
+        yield
+    finally:
+        registry._METHODS.pop(method.name)
 
 
 class TinyImages(gym.Env):

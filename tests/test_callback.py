@@ -9,11 +9,11 @@ import pytest
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback, EveryNTimesteps
 from stable_baselines3.common.logger import configure
-from support import assert_masked, make
+from support import assert_masked, make, registered
 
 from sb3_sparse import SparsityCallback
 from sb3_sparse.errors import ConfigError
-from sb3_sparse.topology import DropGrow, register, registry
+from sb3_sparse.topology import DropGrow
 
 
 @pytest.fixture
@@ -21,7 +21,6 @@ def gradient_spy():
     """RigL that keeps the dense gradients it was handed, by layer."""
     seen: dict[str, list[np.ndarray]] = {}
 
-    @register
     class Spy(DropGrow):
         name = "spy"
         needs_gradient = True
@@ -30,8 +29,8 @@ def gradient_spy():
             seen.setdefault(layer.name, []).append(dense_grad.copy())
             return np.abs(dense_grad[candidates])
 
-    yield seen
-    registry._METHODS.pop("spy")
+    with registered(Spy):
+        yield seen
 
 
 def raw_gradients(model) -> dict[str, list[np.ndarray]]:
@@ -222,6 +221,41 @@ def test_two_callbacks_at_once_are_refused_and_an_interrupted_run_can_go_on():
     assert model.policy.sparse.plan is None
 
 
+def test_after_an_interrupted_run_masks_stand_still_without_a_callback():
+    class Interrupt(BaseCallback):
+        def _on_step(self) -> bool:
+            if self.num_timesteps == 40:
+                raise KeyboardInterrupt
+            return True
+
+    model = make("SAC")
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(400, callback=[SparsityCallback("rigl", update_interval=2), Interrupt()])
+    masks = [layer.mask() for layer in model.policy.sparse.layers]
+    model.learn(40)
+    for layer, mask in zip(model.policy.sparse.layers, masks, strict=True):
+        np.testing.assert_array_equal(layer.mask(), mask)
+
+
+def test_a_pruned_model_can_go_on_with_any_method():
+    model = make("SAC", policy_kwargs=dict(initial_sparsity=0.0))
+    model.learn(60, callback=SparsityCallback("prune", update_interval=2))
+    nnz = [layer.nnz for layer in model.policy.sparse.layers]
+    for method in ("static", "rigl", "prune"):
+        options = {} if method == "static" else dict(update_interval=2)
+        model.learn(40, callback=SparsityCallback(method, **options))
+        assert [layer.nnz for layer in model.policy.sparse.layers] == nnz
+
+
+def test_training_too_short_for_an_update_says_so():
+    with pytest.warns(UserWarning, match=r"no mask update.*20, 20 gradient steps.*is 1000"):
+        make("SAC").learn(40, callback=SparsityCallback("set"))
+
+
+def test_learning_for_no_steps_is_allowed_as_in_sb3():
+    make("PPO").learn(0, callback=SparsityCallback("static"))
+
+
 def test_a_child_of_an_event_callback_moves_masks_too():
     """Such a child gets no rollout and no training-end calls."""
     model = make("SAC", policy_kwargs=dict(initial_sparsity=0.0))
@@ -257,9 +291,13 @@ def test_a_policy_that_is_not_sparse_is_refused():
 
 
 def test_pruning_needs_a_denser_start_and_other_methods_must_not_have_one():
-    with pytest.raises(ConfigError, match="initial_sparsity=0.0 to policy_kwargs"):
+    with pytest.raises(ConfigError, match="initial_sparsity=0.0 in policy_kwargs"):
         make("SAC").learn(10, callback=SparsityCallback("prune"))
     model = make("SAC", policy_kwargs=dict(initial_sparsity=0.0))
+    with pytest.raises(ConfigError, match="give a sparsity above 0"):
+        make("SAC", policy_kwargs=dict(sparsity=0.0, initial_sparsity=0.0)).learn(
+            10, callback=SparsityCallback("prune")
+        )
     with pytest.raises(ConfigError, match="would never take it to its sparsity"):
         model.learn(10, callback=SparsityCallback("rigl"))
 

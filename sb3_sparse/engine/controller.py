@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any
 
@@ -18,6 +18,7 @@ from sb3_sparse.engine.gradients import (
 from sb3_sparse.engine.layers import MaskedLayer
 from sb3_sparse.engine.moments import keep_only
 from sb3_sparse.engine.network import SparseNetwork
+from sb3_sparse.engine.optimizers import add_weight_decay, keep_implementation
 from sb3_sparse.engine.plan import Plan
 
 
@@ -28,22 +29,31 @@ class Controller:
     advances the clocks of the networks it owns and, where an update is due, moves their masks; the
     step itself is then taken with gradients under the new mask.
 
-    Copies and pickles of a controller have no hooks until :meth:`attach` is called again.
+    Copies and pickles of a controller have no plan, and no hooks until :meth:`attach` is called.
 
     :param networks: the sparse networks
     :param seed: mask seed, not negative
     :param functional_gradients: whether the algorithm may take gradients with
         ``torch.autograd.grad`` (see :mod:`sb3_sparse.engine.gradients`)
+    :param weight_decay: coupled L2 coefficient, added to the gradient of every kernel
     """
 
     def __init__(
-        self, networks: list[SparseNetwork], seed: int, functional_gradients: bool
+        self,
+        networks: list[SparseNetwork],
+        seed: int,
+        functional_gradients: bool,
+        weight_decay: float = 0.0,
     ) -> None:
         self.networks = networks
         self.seed = seed
+        self.weight_decay = weight_decay
         self.functional_gradients = functional_gradients
         self.plan: Plan | None = None
+        self._in_force: Callable[[], bool] = bool
         self.progress = 0.0
+        self.updates_due = 0
+        """Updates that have come due since the plan was made, of all networks together."""
         self.soft_targets = True
         self._handles: list[RemovableHandle] = []
         self._hooked: list[object] = []
@@ -52,6 +62,8 @@ class Controller:
     def __getstate__(self) -> dict[str, Any]:
         return {
             **self.__dict__,
+            "plan": None,
+            "_in_force": bool,
             "_handles": [],
             "_hooked": [],
             "_gradient_masks": {},
@@ -86,23 +98,29 @@ class Controller:
         for optimizer in self.optimizers:
             self._handles += [
                 optimizer.register_step_pre_hook(self._before_step),
+                optimizer.register_load_state_dict_pre_hook(keep_implementation),
                 optimizer.register_load_state_dict_post_hook(self._after_load),
             ]
         self._hooked = list(hooked)
 
     def begin_training(self) -> None:
-        """Called at the start of each round of gradient steps: hooks in place, no old gradients."""
+        """Called at the start of each round of gradient steps: hooks in place, nothing outdated."""
         self.attach()
+        if self.plan is not None and not self._in_force():
+            self.plan = None  # of a training that was interrupted
         for mask in self._gradient_masks.values():
             mask.dense_grad = None
 
-    def start(self, plan: Plan, soft_targets: bool) -> None:
+    def start(self, plan: Plan, soft_targets: bool, in_force: Callable[[], bool]) -> None:
         """Let masks move from now on.
 
         :param soft_targets: whether targets follow the mask at once (Polyak averaging) or keep
             their snapshot until the next hard copy
+        :param in_force: whether the training that the plan was made for still goes on
         """
         self.plan = plan
+        self.updates_due = 0
+        self._in_force = in_force
         self.soft_targets = soft_targets
 
     def stop(self) -> None:
@@ -129,10 +147,13 @@ class Controller:
 
     def _capturing(self, network: SparseNetwork) -> bool:
         plan = self.plan
-        if plan is None or not plan.topology.grows:
+        if plan is None or not (plan.topology.grows or plan.topology.needs_gradient):
             return False
-        # A rollout's actor gradient comes before the steps of the rollout are counted.
-        return self.functional_gradients or (network.clock + 1) % plan.update_interval == 0
+        return (
+            self.functional_gradients  # a rollout's actor gradient comes before its steps
+            or (network.clock + 1) % plan.update_interval == 0
+            or self._must_finish(network, plan)
+        )
 
     def _before_step(self, optimizer: th.optim.Optimizer, args: object, kwargs: object) -> None:
         for network in self.networks:
@@ -142,15 +163,19 @@ class Controller:
             self._mask_moments(network)
             if self.functional_gradients:
                 _remask_moved_by_hand(network)
-            plan = self.plan
-            if plan is None:
-                continue
-            gradients = network.take_gradients(self._gradient_masks)
-            if plan.due(network.clock, self.progress) or self._must_finish(network, plan):
-                if plan.update_on == "step":
-                    self._move(network, plan, gradients)
-                else:
-                    network.pending = gradients
+            if self.plan is not None:
+                self._update_if_due(network, self.plan)
+            if self.weight_decay:
+                add_weight_decay(network.kernels, self.weight_decay)
+
+    def _update_if_due(self, network: SparseNetwork, plan: Plan) -> None:
+        gradients = network.take_gradients(self._gradient_masks)
+        if plan.due(network.clock, self.progress) or self._must_finish(network, plan):
+            self.updates_due += 1
+            if plan.update_on == "step":
+                self._move(network, plan, gradients)
+            else:
+                network.pending = gradients
 
     def _mask_moments(self, network: SparseNetwork) -> None:
         for layer in network.layers:
@@ -174,10 +199,10 @@ class Controller:
         dropped = grown = 0
         for layer in network.layers:
             gradient = gradients.get(layer.name)
-            if plan.topology.needs_gradient and (gradient is None or layer.full):
-                continue
             dense_grad = None
-            if plan.topology.needs_gradient and gradient is not None:
+            if plan.topology.needs_gradient:
+                if gradient is None:
+                    continue
                 dense_grad = gradient.detach().cpu().numpy().ravel()
             exchange = plan.topology.exchange(layer, moment, dense_grad=dense_grad)
             if not exchange:

@@ -52,13 +52,12 @@ class AccumulatedGradient(GradientMask):
 
     def _hook(self, weight: th.Tensor) -> None:
         layer = self.layer
-        if layer.nnz == layer.size:
-            return
         grad = weight.grad
         assert grad is not None
         if self.capturing():
             self.dense_grad = grad.clone()
-        grad.mul_(layer.float_mask)
+        if layer.nnz != layer.size:
+            grad.mul_(layer.float_mask)
 
     def take(self) -> th.Tensor | None:
         dense_grad, self.dense_grad = self.dense_grad, None
@@ -74,11 +73,11 @@ class FunctionalGradient(GradientMask):
 
     def _hook(self, grad: th.Tensor) -> th.Tensor | None:
         layer = self.layer
-        if layer.nnz == layer.size:
-            return None
+        full = layer.nnz == layer.size
         if self.dense_grad is None and not grad.requires_grad and self.capturing():
-            self.dense_grad = grad
-        return grad * layer.float_mask
+            # Where nothing is masked, the weight's gradient may become this very tensor.
+            self.dense_grad = grad.clone() if full else grad
+        return None if full else grad * layer.float_mask
 
     def take(self) -> th.Tensor | None:
         dense_grad = self.dense_grad

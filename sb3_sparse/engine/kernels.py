@@ -38,4 +38,10 @@ def find_kernels(
                 f'and Conv layers can); keep it dense with dense_layers=["{name}*"]'
             )
         if isinstance(module, KERNEL_TYPES):
+            if not isinstance(module.weight, nn.Parameter):
+                raise UnsupportedError(
+                    f"the weight of {name} is computed from other parameters (spectral_norm, "
+                    "weight_norm or another parametrization), so it cannot be masked; use a plain "
+                    f"{type(module).__name__}"
+                )
             yield name, module

@@ -56,7 +56,13 @@ class SparseNetwork:
 
     @optimizer.setter
     def optimizer(self, optimizer: th.optim.Optimizer) -> None:
-        setattr(self.owner, "optimizer", optimizer)  # noqa: B010  (nn.Module types no such attribute)
+        vars(self.owner)["optimizer"] = optimizer
+
+    @property
+    def kernels(self) -> list[th.Tensor]:
+        """Weights of all Linear and Conv layers, the ones left dense too."""
+        dense = (module.weight for _, module in self.dense_kernels)
+        return [*(layer.weight for layer in self.layers), *dense]
 
     @property
     def size(self) -> int:

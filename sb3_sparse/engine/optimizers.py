@@ -30,40 +30,45 @@ def check_weight_decay(weight_decay: float, optimizer_kwargs: Mapping[str, Any] 
 
 
 def rebuild(
-    optimizer: th.optim.Optimizer,
-    optimizer_kwargs: Mapping[str, Any],
-    kernels: Iterable[th.Tensor],
-    weight_decay: float,
+    optimizer: th.optim.Optimizer, optimizer_kwargs: Mapping[str, Any]
 ) -> th.optim.Optimizer:
-    """The same optimizer, before its first step, fused and with weight decay on kernels only.
+    """The same optimizer, before its first step, fused where that is a good default.
 
     Adam is fused unless the user chose ``fused``, ``foreach``, ``capturable`` or
     ``differentiable``: eager Adam takes square roots of second moments, which are slow on the exact
-    zeros of a masked weight. Anything else about the optimizer stays as it is.
+    zeros of a masked weight. Any other optimizer stays as it is.
 
     :param optimizer_kwargs: what it was made with, without the learning rate
-    :param kernels: weights to decay
-    :param weight_decay: coupled L2 coefficient (added to the gradient); 0 leaves the groups alone
     """
-    kwargs = dict(optimizer_kwargs)
-    if type(optimizer) in FUSED_BY_DEFAULT and not kwargs.keys() & {
-        "fused",
-        "foreach",
-        "capturable",
-        "differentiable",
-    }:
-        kwargs["fused"] = True
-    if kwargs == dict(optimizer_kwargs) and not weight_decay:
+    chosen = {"fused", "foreach", "capturable", "differentiable"}
+    if type(optimizer) not in FUSED_BY_DEFAULT or chosen & optimizer_kwargs.keys():
         return optimizer
     parameters = [p for group in optimizer.param_groups for p in group["params"]]
-    groups: list[dict[str, Any]] = [{"params": parameters}]
-    if weight_decay:
-        decayed = {id(kernel) for kernel in kernels}
-        groups = [
-            {"params": [p for p in parameters if id(p) not in decayed]},
-            {"params": [p for p in parameters if id(p) in decayed], "weight_decay": weight_decay},
-        ]
-        groups = [group for group in groups if group["params"]]
     optimizer_class: Any = type(optimizer)
-    rebuilt: th.optim.Optimizer = optimizer_class(groups, lr=optimizer.defaults["lr"], **kwargs)
+    rebuilt: th.optim.Optimizer = optimizer_class(
+        parameters, lr=optimizer.defaults["lr"], **optimizer_kwargs, fused=True
+    )
     return rebuilt
+
+
+def keep_implementation(
+    optimizer: th.optim.Optimizer, state_dict: dict[str, Any]
+) -> dict[str, Any]:
+    """Pre-load hook: a state saved by an eager optimizer does not turn a fused one eager."""
+    if "fused" not in optimizer.defaults:
+        return state_dict
+    fused = optimizer.defaults["fused"]
+    groups = [{**group, "fused": fused} for group in state_dict["param_groups"]]
+    return {**state_dict, "param_groups": groups}
+
+
+def add_weight_decay(kernels: Iterable[th.Tensor], weight_decay: float) -> None:
+    """Coupled L2: add ``weight_decay * weight`` to the gradient of every kernel that has one.
+
+    Before the step and after any clipping, as optimizers with a ``weight_decay`` of their own do
+    it, but for kernels only and whatever the optimizer.
+    """
+    with th.no_grad():
+        for kernel in kernels:
+            if kernel.grad is not None:
+                kernel.grad.add_(kernel, alpha=weight_decay)

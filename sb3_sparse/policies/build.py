@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING
 
-import torch as th
 from torch import nn
 
 from sb3_sparse.engine.kernels import KERNEL_TYPES, find_kernels
 from sb3_sparse.engine.network import SparseNetwork
-from sb3_sparse.errors import ConfigError
+from sb3_sparse.errors import ConfigError, UnsupportedError
 from sb3_sparse.policies.config import SparsityConfig
 from sb3_sparse.policies.spec import (
     DENSE_WORDS,
@@ -75,18 +74,6 @@ def build_networks(
     return networks
 
 
-def kernel_parameters(networks: Iterable[SparseNetwork]) -> list[th.Tensor]:
-    """Weights of all Linear and Conv layers, the dense ones too."""
-    return [
-        parameter
-        for network in networks
-        for parameter in (
-            *(layer.weight for layer in network.layers),
-            *(module.weight for _, module in network.dense_kernels),
-        )
-    ]
-
-
 def _find_layers(
     policy: nn.Module,
     modules: Mapping[str, nn.Module],
@@ -118,8 +105,10 @@ def _find_layers(
             fits = {p for p in patterns if matches(name, [p])}
             fits |= {word for word in DENSE_WORDS if word in patterns and name in words[word]}
             unmatched -= fits
-            kind = found[network].dense if name in dense or fits else found[network].sparse
+            left_dense = name in dense or fits or not module.weight.requires_grad
+            kind = found[network].dense if left_dense else found[network].sparse
             kind.append((name, module))
+    _check_complete(policy, specs, seen)
     if unmatched:
         names = [name for kernels in found.values() for name, _ in kernels.sparse + kernels.dense]
         raise ConfigError(
@@ -127,6 +116,19 @@ def _find_layers(
             f"this policy; its layers are {', '.join(names)}, or use the words 'input' and 'output'"
         )
     return found
+
+
+def _check_complete(policy: nn.Module, specs: Mapping[str, NetworkSpec], seen: set[int]) -> None:
+    """Refuse trained kernels that no network has, which would stay dense unnoticed."""
+    targets = tuple(f"{spec.target}." for spec in specs.values() if spec.target is not None)
+    for name, module in find_kernels(policy, "", lambda _: True):
+        trained = module.weight.requires_grad and not name.startswith(targets)
+        if trained and id(module.weight) not in seen:
+            raise UnsupportedError(
+                f"{name} belongs to none of the networks {', '.join(map(repr, specs))} of "
+                f"{type(policy).__name__}; name it, or a module around it, among the roots of one "
+                "in the class attribute `networks`"
+            )
 
 
 def _add_targets(

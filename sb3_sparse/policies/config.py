@@ -30,8 +30,8 @@ class SparsityConfig:
         (``"actor.mu"``, ``"critic.qf*.4"``) or by the words ``"input"`` and ``"output"``
     :param sparsity_aware_init: draw the weights by the fans that are there (a network that starts
         dense keeps SB3's own)
-    :param mask_seed: seed of masks and growth; None: the seed that torch was given, which is SB3's
-        ``seed`` argument
+    :param mask_seed: seed of masks and growth; None: read off torch's generator without advancing
+        it, so that SB3's ``seed`` decides
     :raises ConfigError: for a value that is not allowed
     """
 

@@ -17,7 +17,7 @@ from stable_baselines3.common.type_aliases import Schedule
 from sb3_sparse.engine.controller import Controller
 from sb3_sparse.engine.optimizers import check_weight_decay, rebuild
 from sb3_sparse.errors import CorruptStateError
-from sb3_sparse.policies.build import build_networks, kernel_parameters
+from sb3_sparse.policies.build import build_networks
 from sb3_sparse.policies.config import SparsityConfig
 from sb3_sparse.policies.extractors import choose_extractor
 from sb3_sparse.policies.report import SparsityReport, report_on
@@ -41,7 +41,8 @@ class SparsePolicyMixin(BasePolicy):
     :param dense_layers: layers left dense, by name pattern or the words ``"input"``, ``"output"``
     :param sparsity_aware_init: draw the weights by the fans that are there
     :param weight_decay: coupled L2 on kernels only
-    :param mask_seed: seed of masks and growth; None: the seed that torch was given, which is SB3's
+    :param mask_seed: seed of masks and growth; None: read off torch's generator without advancing
+        it, so that SB3's ``seed`` decides
     :param kwargs: SB3's own policy arguments
     :raises ConfigError: for a value that is not allowed
     :raises UnsupportedError: for layers or observations that cannot be trained sparsely
@@ -86,17 +87,14 @@ class SparsePolicyMixin(BasePolicy):
             kwargs["features_extractor_class"] = self.extractor_class or choose_extractor(
                 observation_space, kwargs.get("normalize_images", True)
             )
+        drawn_seed = peek_seed()
         super().__init__(observation_space, action_space, lr_schedule, **kwargs)
         self.sparsity_config = config
-        self.weight_decay = weight_decay
-        seed = th.initial_seed() % 2**63 if mask_seed is None else mask_seed
+        seed = drawn_seed if mask_seed is None else mask_seed
         networks = build_networks(self, self.networks, config, seed, self._initial_gain)
-        kernels = kernel_parameters(networks)
         for network in {id(network.owner): network for network in networks}.values():
-            network.optimizer = rebuild(
-                network.optimizer, self.optimizer_kwargs, kernels, weight_decay
-            )
-        self.sparse = Controller(networks, seed, self.functional_gradients)
+            network.optimizer = rebuild(network.optimizer, self.optimizer_kwargs)
+        self.sparse = Controller(networks, seed, self.functional_gradients, weight_decay)
         self.sparse.attach()
 
     def __deepcopy__(self: Sparse, memo: dict[int, Any]) -> Sparse:
@@ -135,11 +133,24 @@ class SparsePolicyMixin(BasePolicy):
         self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False
     ) -> Any:
         """As in torch; weights without masks (of a dense policy) are masked, targets too."""
+        self._check_masks(state_dict)
         incompatible = super().load_state_dict(state_dict, strict=strict, assign=assign)
         if not any(key.endswith(".weight_mask") for key in state_dict):
             for layer in self.sparse.layers:
                 layer.mask_targets()
         return incompatible
+
+    def _check_masks(self, state_dict: Mapping[str, Any]) -> None:
+        """Refuse, before anything is loaded, masks of another sparsity."""
+        for layer in self.sparse.layers:
+            mask = state_dict.get(f"{layer.name}.weight_mask")
+            if mask is not None and not layer.final_nnz <= int(mask.sum()) <= layer.initial_nnz:
+                raise CorruptStateError(
+                    f"the mask of {layer.name} has {int(mask.sum())} of {layer.size} connections; "
+                    f"a policy of this sparsity has {layer.final_nnz}"
+                    + (f" to {layer.initial_nnz}" if layer.initial_nnz > layer.final_nnz else "")
+                    + ". Load the file with <algorithm>.load, or make the policy with its sparsity"
+                )
 
     def get_extra_state(self) -> th.Tensor:
         """Mask seed, then clock and number of mask updates of each network; int64."""
@@ -181,11 +192,18 @@ class SparsePolicyMixin(BasePolicy):
             dense_layers=list(config.dense_layers),
             sparsity_aware_init=config.sparsity_aware_init,
             mask_seed=config.mask_seed,
-            weight_decay=self.weight_decay,
+            weight_decay=self.sparse.weight_decay,
         )
         if hasattr(self, "share_features_extractor"):  # SB3 forgets it for some of its policies
             data["share_features_extractor"] = self.share_features_extractor
         return data
+
+
+def peek_seed() -> int:
+    """The next number of torch's global generator, which is left where it is."""
+    generator = th.Generator()
+    generator.set_state(th.get_rng_state())
+    return int(th.randint(2**63 - 1, (), generator=generator))
 
 
 def _without_graph(action_dist: Any) -> Distribution:

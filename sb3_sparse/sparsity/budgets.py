@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.sparsity.distributions import check_sparsity
 
@@ -21,6 +23,16 @@ def feasible_actor_share(
     """Smallest and largest actor share for which no network would need more than all it has."""
     budget = (1.0 - sparsity) * (actor_size + critics_size)
     return max(0.0, 1.0 - critics_size / budget), min(1.0, actor_size / budget)
+
+
+def _rounded_up(low: float) -> float:
+    """The next number of four decimals that is feasible, 0 itself excluded."""
+    return max(1, math.ceil(low * 1e4 - 1e-9)) / 1e4
+
+
+def _rounded_down(high: float) -> float:
+    """The last number of four decimals that is feasible, 1 itself excluded."""
+    return min(9999, math.floor(high * 1e4 + 1e-9)) / 1e4
 
 
 def split_sparsity(
@@ -50,6 +62,6 @@ def split_sparsity(
         raise ConfigError(
             f"actor_share={actor_share} is infeasible at sparsity {sparsity}: it would ask for a "
             f"sparsity of {actor:.4f} in the actor and {critic:.4f} in the critic; choose "
-            f"actor_share between {low:.4f} and {high:.4f} (0 and 1 themselves excluded)"
+            f"actor_share between {_rounded_up(low)} and {_rounded_down(high)}"
         )
     return actor, critic

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from numbers import Real
 
 from sb3_sparse.errors import ConfigError
 
@@ -26,7 +27,7 @@ def check_sparsity(sparsity: float, what: str = "sparsity") -> float:
 
     :raises ConfigError: unless it is a number in [0, 1)
     """
-    if isinstance(sparsity, bool) or not isinstance(sparsity, (int, float)):
+    if isinstance(sparsity, bool) or not isinstance(sparsity, Real):
         raise ConfigError(f"{what} must be a number in [0, 1), got {sparsity!r}")
     if not 0.0 <= sparsity < 1.0:
         raise ConfigError(

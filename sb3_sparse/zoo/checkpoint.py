@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_sparse.policies.mixin import SparsePolicyMixin
 
 BEGIN = 0.8
 CHECKPOINTS = 10
@@ -14,9 +17,9 @@ CHECKPOINTS = 10
 class BestCheckpoint(EvalCallback):
     """Saves the best of ten checkpoints in the last fifth of training as ``best_model.zip``.
 
-    Only there, because before it masks still move and a policy that is being pruned is still denser
-    than it shall be. (The last policy of DQN, dense or sparse, is often a bad moment of an
-    oscillation; the RL zoo keeps its best one for the same reason.)
+    Only there, because before it masks still move, and only once pruning is done. (The last policy
+    of DQN, dense or sparse, is often a bad moment of an oscillation; the RL zoo keeps its best one
+    for the same reason.)
 
     :param eval_env: environments of the evaluation
     :param folder: where to save
@@ -36,9 +39,16 @@ class BestCheckpoint(EvalCallback):
     def _on_training_start(self) -> None:
         self.planned = self.model._total_timesteps
         share = (1.0 - BEGIN) / CHECKPOINTS
-        self.eval_freq = max(1, int(share * self.planned / self.model.n_envs))
+        self.eval_freq = math.ceil(share * self.planned / self.model.n_envs)
 
     def _on_step(self) -> bool:
-        if self.num_timesteps <= BEGIN * self.planned:
+        # A rollout may go on beyond the planned steps.
+        if not BEGIN * self.planned < self.num_timesteps <= self.planned or self._still_denser():
             return True
         return super()._on_step()
+
+    def _still_denser(self) -> bool:
+        policy = self.model.policy
+        return isinstance(policy, SparsePolicyMixin) and any(
+            layer.nnz > layer.final_nnz for layer in policy.sparse.layers
+        )

@@ -30,18 +30,18 @@ class TrainingProgress(BaseCallback):
     def __init__(self, console: Console) -> None:
         super().__init__()
         self.console = console
-
-    def _on_training_start(self) -> None:
-        self.planned = self.model._total_timesteps
-        self.printed = 0
         self.progress = Progress(
             BarColumn(bar_width=30),
             MofNCompleteColumn(),
             TextColumn("steps, {task.fields[status]}"),
             TimeRemainingColumn(),
-            console=self.console,
-            disable=not self.console.is_terminal,
+            console=console,
+            disable=not console.is_terminal,
         )
+
+    def _on_training_start(self) -> None:
+        self.planned = self.model._total_timesteps
+        self.printed = 0
         self.task = self.progress.add_task("", total=self.planned, status=self._status())
         self.progress.start()
 
@@ -67,4 +67,8 @@ class TrainingProgress(BaseCallback):
 
     def _on_training_end(self) -> None:
         self.progress.update(self.task, completed=self.planned, status=self._status())
+        self.close()
+
+    def close(self) -> None:
+        """Give the terminal back, also after an interruption."""
         self.progress.stop()

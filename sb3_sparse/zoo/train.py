@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -69,8 +70,8 @@ class Run:
         check_distribution(self.distribution)
         if self.n_timesteps is not None and self.n_timesteps < 1:
             raise ConfigError(f"the number of steps must be 1 or more, got {self.n_timesteps}")
-        if self.seed < 0:
-            raise ConfigError(f"the seed must be 0 or more, got {self.seed}")
+        if not 0 <= self.seed < 2**31:
+            raise ConfigError(f"the seed must lie in [0, 2^31), got {self.seed}")
 
     @property
     def settings(self) -> Settings:
@@ -205,6 +206,11 @@ def train(
         best = BestCheckpoint(eval_env, folder)
         try:
             model.learn(run.steps, callback=[*own, *callbacks, best])
+        except KeyboardInterrupt:
+            print(
+                f"\nInterrupted after {model.num_timesteps} steps; saving {path}", file=sys.stderr
+            )
+            raise
         finally:
             model.save(path)
             eval_env.close()

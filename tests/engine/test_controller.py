@@ -7,13 +7,14 @@ import copy
 import numpy as np
 import pytest
 import torch as th
+from support import registered
 from torch import nn
 
 from sb3_sparse.engine.controller import Controller
 from sb3_sparse.engine.network import SparseNetwork
 from sb3_sparse.engine.plan import Plan
 from sb3_sparse.errors import TopologyError
-from sb3_sparse.topology import Exchange, TopologyMethod, register
+from sb3_sparse.topology import Exchange, TopologyMethod
 
 # Active: the first two columns. Least magnitudes: flat 5 (0.1), then 4 (0.2).
 WEIGHTS = [[0.5, -0.6, 0.0, 0.0], [-0.2, 0.1, 0.0, 0.0], [0.7, -0.8, 0.0, 0.0]]
@@ -34,7 +35,7 @@ def rig(method="rigl", optimizer=None, functional=False, **plan):
     controller = Controller([network], seed=1, functional_gradients=functional)
     controller.attach()
     settings = dict(update_interval=1, drop_fraction=1 / 3, begin=0.0, end=0.8, update_on="step")
-    controller.start(Plan(method, **{**settings, **plan}), soft_targets=True)
+    controller.start(Plan(method, **{**settings, **plan}), soft_targets=True, in_force=lambda: True)
     return owner, layer, controller
 
 
@@ -83,7 +84,8 @@ def test_moments_are_zeroed_on_drop_and_grow_and_kept_by_what_is_regrown():
 
     owner.optimizer.register_step_pre_hook(look)  # after ours: between the move and the step
     weight_before = layer.weight.detach().clone()
-    controller.start(Plan("rigl", 1, 1 / 3, 0.0, 0.8, "step"), soft_targets=True)
+    plan = Plan("rigl", 1, 1 / 3, 0.0, 0.8, "step")
+    controller.start(plan, soft_targets=True, in_force=lambda: True)
     step(owner)
     for moment in (seen["exp_avg"], seen["exp_avg_sq"]):
         assert moment.flatten()[5] == 0  # dropped
@@ -198,6 +200,8 @@ def test_a_copy_trains_on_its_own_once_hooks_are_attached_and_the_original_stays
     owner, layer, controller = rig()
     owner.controller = controller
     twin = copy.deepcopy(owner)
+    assert twin.controller.plan is None
+    twin.controller.start(controller.plan, soft_targets=True, in_force=lambda: True)
     twin.controller.attach()
     step(twin)
     assert np.flatnonzero(twin.controller.networks[0].layers[0].mask()).tolist() == [
@@ -241,7 +245,59 @@ def test_loaded_weights_are_masked_at_once_and_loaded_moments_before_the_next_st
     assert not owner.optimizer.state[layer.weight]["exp_avg"][inactive].any()
 
 
-@register
+def test_a_plan_of_a_training_that_is_over_is_dropped_at_the_next_one():
+    _, _, controller = rig()
+    going_on = True
+    controller.start(controller.plan, soft_targets=True, in_force=lambda: going_on)
+    controller.begin_training()
+    assert controller.plan is not None
+    going_on = False
+    controller.begin_training()
+    assert controller.plan is None
+
+
+def test_weight_decay_is_coupled_added_after_clipping_and_on_kernels_only():
+    owner = nn.Sequential(nn.Linear(4, 3))
+    owner.optimizer = th.optim.SGD(owner.parameters(), lr=1.0)
+    network = SparseNetwork("net", owner, [("0", owner[0])])
+    controller = Controller([network], 1, functional_gradients=False, weight_decay=0.25)
+    controller.attach()
+    with th.no_grad():
+        owner[0].weight.fill_(2.0)
+        owner[0].bias.fill_(2.0)
+    network.layers[0].set_mask(np.tile([True, False], 6))
+    (owner[0].weight.sum() + owner[0].bias.sum()).backward()
+    # 6 active weights and 3 biases with gradient 1: norm 3, clipped to 1.5.
+    nn.utils.clip_grad_norm_(owner.parameters(), 1.5)
+    owner.optimizer.step()
+    # weight: 2 - (0.5 + 0.25 * 2); bias: 2 - 0.5
+    expected = np.tile([1.0, 0.0], 6)
+    np.testing.assert_allclose(network.layers[0].dense(), expected, rtol=1e-5)
+    np.testing.assert_allclose(owner[0].bias.detach(), 1.5, rtol=1e-5)
+
+
+class ByGradient(TopologyMethod):
+    """Prunes where the gradient is least: a method with a gradient that never grows."""
+
+    name = "gradient-prune-for-tests"
+    needs_gradient = True
+
+    def exchange(self, layer, moment, *, dense_grad):
+        score = np.where(layer.mask(), np.abs(dense_grad), np.inf)
+        return Exchange(dropped=np.array([score.argmin()]), grown=np.empty(0, dtype=np.int64))
+
+
+@pytest.mark.parametrize("functional", [False, True])
+def test_a_method_may_prune_by_gradient_also_from_dense(functional):
+    with registered(ByGradient):
+        owner, layer, _ = rig(ByGradient.name, functional=functional)
+        layer.set_mask(np.ones(12, dtype=bool))
+        step(owner)  # the least gradient is 0.0, at 6
+        assert np.flatnonzero(~layer.mask()).tolist() == [6]
+        step(owner)  # then 0.5, at 5
+        assert np.flatnonzero(~layer.mask()).tolist() == [5, 6]
+
+
 class Greedy(TopologyMethod):
     """Drops what is not there."""
 
@@ -254,12 +310,8 @@ class Greedy(TopologyMethod):
 
 
 def test_an_impossible_exchange_of_a_third_party_is_refused_by_name():
-    from sb3_sparse.topology import registry
-
-    try:
-        owner, layer, _ = rig("greedy-for-tests")
+    with registered(Greedy):
+        owner, layer, _ = rig(Greedy.name)
         with pytest.raises(TopologyError, match="exchange for 0 drops 1 and grows 0"):
             step(owner)
         assert layer.nnz == 6
-    finally:
-        registry._METHODS.pop("greedy-for-tests")

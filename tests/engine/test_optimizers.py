@@ -4,7 +4,7 @@ import pytest
 import torch as th
 from torch import nn
 
-from sb3_sparse.engine.optimizers import check_weight_decay, rebuild
+from sb3_sparse.engine.optimizers import check_weight_decay, keep_implementation, rebuild
 from sb3_sparse.errors import ConfigError
 
 
@@ -15,7 +15,7 @@ def net() -> nn.Linear:
 
 def test_adam_is_fused_by_default_and_keeps_its_other_settings(net):
     kwargs = dict(betas=(0.5, 0.999), eps=1e-5)
-    optimizer = rebuild(th.optim.Adam(net.parameters(), lr=0.1, **kwargs), kwargs, [], 0.0)
+    optimizer = rebuild(th.optim.Adam(net.parameters(), lr=0.1, **kwargs), kwargs)
     assert optimizer.defaults["fused"] is True
     assert optimizer.defaults["betas"] == (0.5, 0.999)
     assert optimizer.defaults["eps"] == 1e-5
@@ -25,26 +25,25 @@ def test_adam_is_fused_by_default_and_keeps_its_other_settings(net):
 @pytest.mark.parametrize("choice", [dict(fused=False), dict(foreach=True)])
 def test_the_users_choice_of_implementation_stands(net, choice):
     original = th.optim.Adam(net.parameters(), lr=0.1, **choice)
-    assert rebuild(original, choice, [], 0.0) is original
+    assert rebuild(original, choice) is original
 
 
 def test_other_optimizers_stay_as_they_are(net):
     original = th.optim.RMSprop(net.parameters(), lr=0.1)
-    assert rebuild(original, {}, [], 0.0) is original
+    assert rebuild(original, {}) is original
 
 
-def test_weight_decay_is_coupled_and_on_kernels_only(net):
-    original = th.optim.SGD(net.parameters(), lr=1.0)
-    optimizer = rebuild(original, {}, [net.weight], 0.25)
-    with th.no_grad():
-        net.weight.fill_(2.0)
-        net.bias.fill_(2.0)
-    for parameter in net.parameters():
-        parameter.grad = th.ones_like(parameter)
-    optimizer.step()
-    # weight: 2 - (1 + 0.25 * 2); bias: 2 - 1
-    assert (net.weight == 0.5).all()
-    assert (net.bias == 1.0).all()
+def test_a_state_saved_by_an_eager_optimizer_leaves_a_fused_one_fused(net):
+    eager = th.optim.Adam(net.parameters(), lr=0.1)
+    net(th.ones(1, 3)).sum().backward()
+    eager.step()
+    fused = rebuild(th.optim.Adam(net.parameters(), lr=0.1), {})
+    fused.register_load_state_dict_pre_hook(keep_implementation)
+    fused.load_state_dict(eager.state_dict())
+    assert fused.param_groups[0]["fused"] is True
+    moments = eager.state[net.weight]["exp_avg"]
+    assert th.equal(fused.state[net.weight]["exp_avg"], moments)
+    fused.step()
 
 
 @pytest.mark.parametrize("wrong", [-1e-4, float("inf"), float("nan"), "small", True])

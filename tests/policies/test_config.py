@@ -59,8 +59,13 @@ def test_actor_share_divides_what_remains_with_both_critics_counted():
 
 def test_an_infeasible_actor_share_names_the_feasible_range():
     # 0.8 * 2088 = 1670.4 remain; the actor can take 696 of them, the critics 1392.
-    with pytest.raises(ConfigError, match=r"between 0.1667 and 0.4167"):
+    with pytest.raises(ConfigError, match=r"between 0.1667 and 0.4166"):
         make("SAC", policy_kwargs=dict(sparsity=0.2, actor_share=0.9))
+
+
+@pytest.mark.parametrize("share", [0.1667, 0.4166])
+def test_the_ends_of_the_range_that_is_named_are_feasible(share):
+    make("SAC", policy_kwargs=dict(sparsity=0.2, actor_share=share))
 
 
 def test_actor_share_needs_an_actor():

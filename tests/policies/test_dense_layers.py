@@ -4,9 +4,14 @@ from __future__ import annotations
 
 import gymnasium as gym
 import pytest
+import torch as th
+from stable_baselines3 import DQN
+from stable_baselines3.common.torch_layers import FlattenExtractor
 from support import make
+from torch import nn
 
-from sb3_sparse.errors import ConfigError
+from sb3_sparse import SparseDQNPolicy, SparsityCallback
+from sb3_sparse.errors import ConfigError, UnsupportedError
 
 INPUTS = {
     "DQN": {"q_net.q_net.0"},
@@ -89,10 +94,51 @@ def test_leaving_a_whole_network_dense_is_refused():
 
 
 def test_weight_decay_reaches_dense_kernels_too_and_no_bias():
-    model = make("DQN", policy_kwargs=dict(dense_layers=["output"], weight_decay=1e-3))
-    groups = model.policy.optimizer.param_groups
-    decayed = {id(p) for g in groups if g["weight_decay"] == 1e-3 for p in g["params"]}
-    named = dict(model.policy.q_net.named_parameters())
-    assert decayed == {id(p) for name, p in named.items() if name.endswith("weight")}
-    others = {id(p) for g in groups if g["weight_decay"] == 0 for p in g["params"]}
-    assert others == {id(p) for name, p in named.items() if name.endswith("bias")}
+    plain, decayed = (
+        make("DQN", policy_kwargs=dict(dense_layers=["output"], weight_decay=weight_decay))
+        for weight_decay in (0.0, 0.5)
+    )
+    for model in (plain, decayed):
+        optimizer = model.policy.optimizer = th.optim.SGD(model.q_net.parameters(), lr=1.0)
+        model.policy.sparse.attach()
+        for parameter in model.q_net.parameters():
+            parameter.grad = th.zeros_like(parameter)
+        optimizer.step()
+    ours = dict(decayed.q_net.named_parameters())
+    for name, parameter in plain.q_net.named_parameters():
+        factor = 0.5 if name.endswith("weight") else 1.0
+        assert th.equal(ours[name], factor * parameter), name
+
+
+def test_a_frozen_layer_stays_dense_and_outside_the_budget():
+    class Frozen(FlattenExtractor):
+        def __init__(self, space):
+            super().__init__(space)
+            self.encoder = nn.Linear(4, 4).requires_grad_(False)
+
+        def forward(self, observations):
+            return self.encoder(super().forward(observations))
+
+    model = make("DQN", policy_kwargs=dict(features_extractor_class=Frozen))
+    assert dense_names(model) == {"q_net.features_extractor.encoder"}
+    model.learn(60, callback=SparsityCallback("rigl", update_interval=5))
+
+
+def test_a_weight_that_is_computed_is_refused():
+    class Spectral(FlattenExtractor):
+        def __init__(self, space):
+            super().__init__(space)
+            self.encoder = nn.utils.spectral_norm(nn.Linear(4, 4))
+
+    with pytest.raises(UnsupportedError, match=r"encoder is computed.*use a plain Linear"):
+        make("DQN", policy_kwargs=dict(features_extractor_class=Spectral))
+
+
+def test_a_layer_that_no_network_has_is_refused_rather_than_left_dense_unnoticed():
+    class Aside(SparseDQNPolicy):
+        def _build(self, lr_schedule):
+            super()._build(lr_schedule)
+            self.aside = nn.Linear(4, 4)
+
+    with pytest.raises(UnsupportedError, match=r"aside belongs to none of .*'q_net'.*`networks`"):
+        DQN(Aside, "CartPole-v1", policy_kwargs=dict(sparsity=0.9))

@@ -20,6 +20,11 @@ def test_same_seed_same_masks_and_another_seed_others():
     assert any((first[name] != third[name]).any() for name in first)
 
 
+def test_models_without_a_seed_differ_as_those_of_sb3_do():
+    one, two = (masks_of(make("SAC", seed=None)) for _ in range(2))
+    assert any((one[name] != two[name]).any() for name in one)
+
+
 def test_mask_seed_alone_decides_masks_and_sparse_weights():
     one, two = (make("SAC", seed=seed, policy_kwargs=dict(mask_seed=7)) for seed in (0, 1))
     for a, b in zip(one.policy.sparse.layers, two.policy.sparse.layers, strict=True):

@@ -149,7 +149,7 @@ def test_a_resumed_run_makes_the_moves_of_an_uninterrupted_one(name, method, tmp
         each.set_logger(model.logger)
         sparse = each.policy.sparse
         sparse.progress = 0.3
-        sparse.start(plan, soft_targets=name == "SAC")
+        sparse.start(plan, soft_targets=name == "SAC", in_force=lambda: True)
         np.random.seed(1)
         th.manual_seed(1)
         for _ in range(3):
@@ -232,6 +232,24 @@ def test_the_mask_seed_that_growth_uses_is_saved(tmp_path):
     th.manual_seed(12345)
     loaded = ALGORITHMS["SAC"].load(tmp_path / "model", device="cpu")
     assert loaded.policy.sparse.seed == model.policy.sparse.seed
+
+
+def test_masks_of_another_sparsity_are_refused_before_anything_is_loaded():
+    denser, model = make("SAC", policy_kwargs=dict(sparsity=0.5)), make("SAC")
+    before = state_of(model)
+    with pytest.raises(CorruptStateError, match=r"policy of this sparsity has \d+\. Load"):
+        model.set_parameters(denser.get_parameters())
+    assert_same(before, state_of(model))
+
+
+def test_a_dense_checkpoint_can_be_pruned_with_weight_decay_and_stays_fused():
+    dense = make("PPO", policy="MlpPolicy")
+    dense.learn(64)
+    model = make("PPO", policy_kwargs=dict(initial_sparsity=0.0, weight_decay=1e-4))
+    model.set_parameters(dense.get_parameters(), exact_match=False)
+    assert model.policy.optimizer.param_groups[0]["fused"] is True
+    model.learn(128, callback=SparsityCallback("prune", update_interval=2))
+    assert_masked(model)
 
 
 def test_weights_set_from_a_vector_are_masked():

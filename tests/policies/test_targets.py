@@ -11,7 +11,7 @@ from sb3_sparse.engine.plan import Plan
 def move_everything(model, soft: bool) -> None:
     """One SET update of all networks, with no gradient step."""
     sparse = model.policy.sparse
-    sparse.start(Plan("set", 1, 0.5, 0.0, 0.8, "step"), soft_targets=soft)
+    sparse.start(Plan("set", 1, 0.5, 0.0, 0.8, "step"), soft_targets=soft, in_force=lambda: True)
     for network in sparse.networks:
         sparse._move(network, sparse.plan, {})
     sparse.stop()

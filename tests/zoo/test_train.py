@@ -26,6 +26,22 @@ def test_an_interrupted_run_leaves_its_model_behind(tmp_path):
     assert model.num_timesteps == 300
 
 
+@pytest.mark.parametrize(("algo", "method"), [("ppo", "prune"), ("dqn", "prune"), ("ppo", "dense")])
+def test_the_best_checkpoint_is_pruned_and_one_of_ten(algo, method, tmp_path, monkeypatch):
+    evaluated = []
+    monkeypatch.setattr(
+        "stable_baselines3.common.callbacks.evaluate_policy",
+        lambda model, *args, **kwargs: (evaluated.append(model.num_timesteps), ([1.0], [1]))[1],
+    )
+    _, results = train(Run(algo, method=method, n_timesteps=2000), tmp_path, [])
+    assert 1 <= len(evaluated) <= 10
+    assert all(1600 < steps <= 2000 for steps in evaluated)
+    for result in results:
+        model = algorithms()[algo].load(result.path)
+        if method == "prune":
+            assert all(layer.nnz == layer.final_nnz for layer in model.policy.sparse.layers)
+
+
 def test_folders_are_numbered_on_and_never_shared(tmp_path):
     (tmp_path / "A-v1_7").mkdir()
     (tmp_path / "A-v1_old").mkdir()
@@ -55,5 +71,5 @@ def test_the_algorithms_are_those_with_a_sparse_policy():
 
 
 def test_a_negative_seed_is_refused():
-    with pytest.raises(ConfigError, match="seed must be 0 or more"):
+    with pytest.raises(ConfigError, match="seed must lie in"):
         Run(seed=-1)
