@@ -21,14 +21,15 @@ import argparse
 import csv
 import time
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 
+from sb3_sparse.zoo.checkpoint import BestCheckpoint
 from sb3_sparse.zoo.train import Run, evaluate, make_env, make_model, reached_sparsity
 
 RESULTS = Path(__file__).parent.parent / "docs" / "results"
@@ -38,30 +39,6 @@ METHODS = ("dense", "static", "set", "rigl", "prune")
 BARS = {"CartPole-v1": 450.0, "Pendulum-v1": -250.0}
 FIELDS = ("algo", "env", "method", "seed", "sparsity", "steps", "last", "best", "seconds")
 EPISODES = 50
-CHECKPOINTS = 10
-
-
-class BestCheckpoint(BaseCallback):
-    """Keeps the weights of the best of ten checkpoints in the last fifth of training."""
-
-    def __init__(self, run: Run) -> None:
-        super().__init__()
-        self.spec = run
-        self.score = -float("inf")
-        self.weights: dict[str, th.Tensor] = {}
-        self.passed = 0
-
-    def _on_step(self) -> bool:
-        steps = self.spec.steps
-        mark = int(0.8 * steps + (self.passed + 1) * 0.2 * steps / CHECKPOINTS)
-        if self.num_timesteps >= mark:
-            self.passed += 1
-            score, _ = evaluate(self.model, replace(self.spec, seed=self.spec.seed + 500), 10)
-            if score > self.score:
-                self.score = score
-                state = self.model.policy.state_dict()
-                self.weights = {key: value.clone() for key, value in state.items()}
-        return True
 
 
 def one_run(algo: str, method: str, seed: int) -> dict[str, object]:
@@ -70,13 +47,14 @@ def one_run(algo: str, method: str, seed: int) -> dict[str, object]:
     run = Run(algo, TASKS[algo], method, seed=seed, n_timesteps=STEPS.get(algo))
     env = make_env(run)
     model, callbacks = make_model(run, env)
-    best = BestCheckpoint(run)
-    start = time.perf_counter()
-    model.learn(run.steps, callback=[*callbacks, best])
-    seconds = time.perf_counter() - start
-    last_return, _ = evaluate(model, run, EPISODES)
-    model.policy.load_state_dict(best.weights)
-    best_return, _ = evaluate(model, run, EPISODES)
+    with TemporaryDirectory() as folder:
+        eval_env = make_vec_env(run.env_id, n_envs=1, seed=seed + 20_000)
+        best = BestCheckpoint(eval_env, Path(folder))
+        start = time.perf_counter()
+        model.learn(run.steps, callback=[*callbacks, best])
+        seconds = time.perf_counter() - start
+        last_return, _ = evaluate(model, run, EPISODES)
+        best_return, _ = evaluate(type(model).load(best.path), run, EPISODES)
     env.close()
     values = (
         algo, run.env_id, method, seed, f"{reached_sparsity(model) or 0.0:.4f}", run.steps,
