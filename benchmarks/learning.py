@@ -100,12 +100,18 @@ def table(path: Path) -> str:
             found.sort(key=lambda row: int(row["seed"]))
             if not found:
                 continue
-            last, best = ([float(row[key]) for row in found] for key in ("last", "best"))
-            passed = [sum(value >= BARS[env] for value in values) for values in (last, best)]
+            cells = [
+                ", ".join(f"{float(r[key]):.0f}" if r[key] else "–" for r in found)
+                for key in ("last", "best")
+            ]
+            passed = [
+                sum(bool(r[key]) and float(r[key]) >= BARS[env] for r in found)
+                for key in ("last", "best")
+            ]
+            counts = f"{passed[0]}" if not found[0]["best"] else f"{passed[0]} and {passed[1]}"
             lines.append(
-                f"| {algo.upper()}, {env} | {method} "
-                f"| {', '.join(f'{v:.0f}' for v in last)} | {', '.join(f'{v:.0f}' for v in best)} "
-                f"| {passed[0]} and {passed[1]} of {len(found)} ≥ {BARS[env]:.0f} |"
+                f"| {algo.upper()}, {env} | {method} | {cells[0]} | {cells[1]} "
+                f"| {counts} of {len(found)} ≥ {BARS[env]:.0f} |"
             )
     return "\n".join(lines)
 

@@ -65,8 +65,8 @@ def test_what_remains_meets_the_total_and_the_share(actor_size, critics_size, sp
     assert 0 <= critic < 1
 
 
-# At 0.2, 173056 of 216320 remain. The actor can hold 72960 of them (0.4216), the critics 143360, so
-# that 29696 must be the actor's (0.1716).
+# At 0.2, 173056 of 216320 remain. The actor can hold 72960 of them (0.42159), the critics 143360,
+# so that 29696 must be the actor's (0.17160). The range is named rounded inwards.
 def test_feasible_range_when_both_ends_bind():
     low, high = feasible_actor_share(ACTOR, CRITICS, 0.2)
     assert low == pytest.approx(29696 / 173056, abs=1e-12)
@@ -86,7 +86,7 @@ def test_every_share_is_feasible_when_each_side_could_hold_all():
 
 @pytest.mark.parametrize("share", [0.43, 0.17, 0.9, 0.01, 0, 1, 0.0, 1.0, -0.5, 1.5])
 def test_infeasible_share_is_an_error_that_names_the_range(share):
-    with pytest.raises(ConfigError, match=r"between 0\.1716 and 0\.4216") as caught:
+    with pytest.raises(ConfigError, match=r"between 0\.1716 and 0\.4215") as caught:
         split_sparsity(ACTOR, CRITICS, 0.2, share)
     assert f"actor_share={share}" in str(caught.value)
 
@@ -111,7 +111,7 @@ def test_share_at_the_very_edge_leaves_one_side_dense():
 
 @pytest.mark.parametrize("share", [0, 1])
 def test_a_share_that_leaves_one_side_nothing_is_an_error(share):
-    with pytest.raises(ConfigError, match="0 and 1 themselves excluded"):
+    with pytest.raises(ConfigError, match="between 0\.0001 and 0\.9999"):
         split_sparsity(ACTOR, CRITICS, 0.9, share)
 
 
