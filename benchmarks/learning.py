@@ -108,7 +108,11 @@ def table(path: Path) -> str:
                 sum(bool(r[key]) and float(r[key]) >= BARS[env] for r in found)
                 for key in ("last", "best")
             ]
-            counts = f"{passed[0]}" if not found[0]["best"] else f"{passed[0]} and {passed[1]}"
+            counts = (
+                f"{passed[0]}"
+                if not all(r["best"] for r in found)
+                else f"{passed[0]} and {passed[1]}"
+            )
             lines.append(
                 f"| {algo.upper()}, {env} | {method} | {cells[0]} | {cells[1]} "
                 f"| {counts} of {len(found)} ≥ {BARS[env]:.0f} |"

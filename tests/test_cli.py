@@ -30,7 +30,7 @@ def test_train_saves_evaluates_and_says_where_and_inspect_reads_it(tmp_path):
     assert DQN.load(path).num_timesteps == 1536  # whole rollouts of 256
     assert 1200 < DQN.load(path.with_name("best_model.zip")).num_timesteps <= 1536
 
-    done = sb3_sparse("inspect", str(path), cwd=tmp_path)
+    done = sb3_sparse("inspect", str(path.with_suffix("")), cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     # 4-256-256-2 at 90 %: 1024 + 65536 + 512 connections.
     assert re.search(r"q_net\.q_net\.2\s+256x256\s+5,173\s+0\.0789", done.stdout)

@@ -13,6 +13,7 @@ Two kinds of algorithm, two hooks:
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 
 import torch as th
@@ -21,7 +22,7 @@ from torch.utils.hooks import RemovableHandle
 from sb3_sparse.engine.layers import MaskedLayer
 
 
-class GradientMask:
+class GradientMask(ABC):
     """Hook on the gradient of one layer.
 
     :param layer: the layer
@@ -33,13 +34,13 @@ class GradientMask:
         self.capturing = capturing
         self.dense_grad: th.Tensor | None = None
 
+    @abstractmethod
     def attach(self) -> RemovableHandle:
         """Register the hook on the weight as it is now."""
-        raise NotImplementedError
 
+    @abstractmethod
     def take(self) -> th.Tensor | None:
         """The dense gradient that the optimizer is about to apply, or None if there is none."""
-        raise NotImplementedError
 
 
 class AccumulatedGradient(GradientMask):

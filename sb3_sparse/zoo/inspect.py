@@ -18,6 +18,8 @@ def load_sparse_policy(path: Path) -> SparsePolicyMixin:
 
     :raises ConfigError: if there is no such file, or no sparse policy in it
     """
+    if not path.suffix and path.with_suffix(".zip").is_file():
+        path = path.with_suffix(".zip")  # as SB3 does
     if not path.is_file():
         raise ConfigError(f"there is no file {path}; give a model saved by SB3, e.g. model.zip")
     try:
