@@ -75,8 +75,8 @@ class SparsityCallback(BaseCallback):
         if not isinstance(policy, SparsePolicyMixin):
             raise ConfigError(
                 f"SparsityCallback needs a sparse policy, got {type(policy).__name__}; make the "
-                "model "
-                'with SparsePolicy, e.g. SAC("SparsePolicy", env, policy_kwargs=dict(sparsity=0.9))'
+                'model with SparsePolicy, e.g. SAC("SparsePolicy", env, '
+                "policy_kwargs=dict(sparsity=0.9))"
             )
         return policy
 
@@ -90,7 +90,7 @@ class SparsityCallback(BaseCallback):
                 f"method {self.plan.method!r} needs a policy that starts denser than it ends: give "
                 "a sparsity above 0 and initial_sparsity=0.0 in policy_kwargs"
             )
-        denser = any(layer.nnz > layer.final_nnz for layer in layers)
+        denser = any(network.denser for network in policy.sparse.networks)
         if not self.plan.topology.reaches_final and denser:
             raise ConfigError(
                 f"the policy starts at initial_sparsity={policy.sparsity_config.initial_sparsity}, "
@@ -151,11 +151,10 @@ class SparsityCallback(BaseCallback):
         sparse = self._sparse_policy().sparse
         networks = sparse.networks
         record = self.logger.record
-        nnz = sum(network.nnz for network in networks)
-        record("sparsity/total", 1.0 - nnz / sum(network.size for network in networks))
+        record("sparsity/total", sparse.sparsity)
         for network in networks:
             record(f"sparsity/{network.name}", 1.0 - network.nnz / network.size)
-        record("sparsity/nnz", nnz)
+        record("sparsity/nnz", sum(network.nnz for network in networks))
         record("sparsity/mask_updates", max(network.mask_updates for network in networks))
         record("sparsity/mask_churn", max(network.churn for network in networks))
         record("sparsity/drop_fraction", self.plan.drop_fraction_at(sparse.progress))

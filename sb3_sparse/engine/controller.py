@@ -75,6 +75,11 @@ class Controller:
         return (layer for network in self.networks for layer in network.layers)
 
     @property
+    def sparsity(self) -> float:
+        """Removed fraction of all connections within the budgets, now."""
+        return 1.0 - sum(n.nnz for n in self.networks) / sum(n.size for n in self.networks)
+
+    @property
     def optimizers(self) -> list[th.optim.Optimizer]:
         """Every optimizer that owns a network, once."""
         return list({id(n.optimizer): n.optimizer for n in self.networks}.values())
@@ -120,6 +125,8 @@ class Controller:
         """
         self.plan = plan
         self.updates_due = 0
+        for network in self.networks:
+            network.pending = None  # of a training that was interrupted
         self._in_force = in_force
         self.soft_targets = soft_targets
 
@@ -139,11 +146,7 @@ class Controller:
             network.pending = None
 
     def _must_finish(self, network: SparseNetwork, plan: Plan) -> bool:
-        return (
-            plan.topology.reaches_final
-            and self.progress >= plan.end
-            and any(layer.nnz > layer.final_nnz for layer in network.layers)
-        )
+        return plan.topology.reaches_final and self.progress >= plan.end and network.denser
 
     def _capturing(self, network: SparseNetwork) -> bool:
         plan = self.plan

@@ -34,10 +34,6 @@ class SparseNetwork:
         self.owner = owner
         self.layers = [MaskedLayer(layer_name, module) for layer_name, module in kernels]
         self.dense_kernels = list(dense_kernels)
-        self.sparsity = 0.0
-        """Sparsity that was asked for, removed fraction of the kernels within the budget."""
-        self.initial_sparsity = 0.0
-        """Sparsity that training starts with."""
         self.clock = 0
         """Gradient steps that the owning optimizer has begun."""
         self.mask_updates = 0
@@ -74,6 +70,11 @@ class SparseNetwork:
         """Active connections, within the budget."""
         return sum(layer.nnz for layer in self.layers)
 
+    @property
+    def denser(self) -> bool:
+        """Whether a layer still has more connections than the requested sparsity leaves it."""
+        return any(layer.nnz > layer.final_nnz for layer in self.layers)
+
     def initialise(
         self,
         sparsity: float,
@@ -91,8 +92,6 @@ class SparseNetwork:
         :param gains: SB3's gain of each layer by name, to redraw the weights by the fans that are
             there; None keeps SB3's own weights, masked
         """
-        self.sparsity = sparsity
-        self.initial_sparsity = initial_sparsity
         shapes = [layer.shape for layer in self.layers]
         final = active_counts(shapes, sparsity, distribution)
         initial = active_counts(shapes, initial_sparsity, distribution)

@@ -100,12 +100,11 @@ def _find_layers(
             "input": input_layers(policy, spec, list(kernels)),
             "output": output_layers(spec, list(kernels)),
         }
-        dense = {name for word in words if word in patterns for name in words[word]}
         for name, module in kernels.items():
             fits = {p for p in patterns if matches(name, [p])}
             fits |= {word for word in DENSE_WORDS if word in patterns and name in words[word]}
             unmatched -= fits
-            left_dense = name in dense or fits or not module.weight.requires_grad
+            left_dense = fits or not module.weight.requires_grad
             kind = found[network].dense if left_dense else found[network].sparse
             kind.append((name, module))
     _check_complete(policy, specs, seen)

@@ -41,10 +41,6 @@ class NetworkKernels:
     dense: list[tuple[str, Kernel]] = field(default_factory=list)
 
 
-def _within(name: str, patterns: Sequence[str]) -> bool:
-    return any(fnmatchcase(name, p) or fnmatchcase(name, f"{p}.*") for p in patterns)
-
-
 def _by_module(names: Sequence[str], patterns: Sequence[str]) -> Iterator[list[str]]:
     """Groups of layer names that lie in the same module matched by a pattern."""
     for pattern in patterns:
@@ -100,4 +96,8 @@ def output_layers(spec: NetworkSpec, names: Sequence[str]) -> set[str]:
 
 def matches(name: str, patterns: Sequence[str]) -> bool:
     """Whether a layer's dotted name, or a module around it, matches one of the patterns."""
-    return _within(name, [p for p in patterns if p not in DENSE_WORDS])
+    return any(
+        fnmatchcase(name, pattern) or fnmatchcase(name, f"{pattern}.*")
+        for pattern in patterns
+        if pattern not in DENSE_WORDS
+    )

@@ -50,5 +50,5 @@ class BestCheckpoint(EvalCallback):
     def _still_denser(self) -> bool:
         policy = self.model.policy
         return isinstance(policy, SparsePolicyMixin) and any(
-            layer.nnz > layer.final_nnz for layer in policy.sparse.layers
+            network.denser for network in policy.sparse.networks
         )

@@ -50,9 +50,7 @@ class TrainingProgress(BaseCallback):
         text = f"return {fmean(returns):.1f}" if returns else "return –"
         policy = self.model.policy
         if isinstance(policy, SparsePolicyMixin):
-            networks = policy.sparse.networks
-            density = sum(n.nnz for n in networks) / sum(n.size for n in networks)
-            text += f", sparsity {1 - density:.2%}"
+            text += f", sparsity {policy.sparse.sparsity:.2%}"
         return text
 
     def _on_step(self) -> bool:

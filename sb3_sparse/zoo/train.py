@@ -247,4 +247,4 @@ def new_run_folder(parent: Path, env_id: str) -> Path:
 def reached_sparsity(model: BaseAlgorithm) -> float | None:
     """Sparsity of a model now; None if its policy is a stock one."""
     policy = model.policy
-    return policy.sparsity_report().sparsity() if isinstance(policy, SparsePolicyMixin) else None
+    return policy.sparse.sparsity if isinstance(policy, SparsePolicyMixin) else None

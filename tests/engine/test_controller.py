@@ -174,6 +174,15 @@ def test_on_rollout_the_move_waits_and_uses_the_gradient_of_the_step_that_was_du
     np.testing.assert_array_equal(layer.mask(), masked)
 
 
+def test_an_update_left_waiting_by_an_interruption_is_forgotten():
+    owner, layer, controller = rig(update_on="rollout")
+    before = layer.mask()
+    step(owner)
+    controller.start(controller.plan, soft_targets=True, in_force=lambda: True)
+    controller.flush()
+    np.testing.assert_array_equal(layer.mask(), before)
+
+
 def test_a_gradient_of_another_loss_after_the_step_does_not_reach_the_next_growth():
     owner, layer, _ = rig()
     step(owner, [[0.0] * 4] * 3)
