@@ -20,6 +20,7 @@ from sb3_sparse.errors import CorruptStateError
 from sb3_sparse.policies.build import build_networks
 from sb3_sparse.policies.config import SparsityConfig
 from sb3_sparse.policies.extractors import choose_extractor
+from sb3_sparse.policies.named import import_named
 from sb3_sparse.policies.report import SparsityReport, report_on
 from sb3_sparse.policies.spec import NetworkSpec
 
@@ -43,7 +44,8 @@ class SparsePolicyMixin(BasePolicy):
     :param weight_decay: coupled L2 on kernels only
     :param mask_seed: seed of masks and growth; None: read off torch's generator without advancing
         it, so that SB3's ``seed`` decides
-    :param kwargs: SB3's own policy arguments
+    :param kwargs: SB3's own policy arguments; ``features_extractor_class``, ``optimizer_class`` and
+        ``activation_fn`` may also be dotted paths, e.g. ``"torch.nn.ReLU"``
     :raises ConfigError: for a value that is not allowed
     :raises UnsupportedError: for layers or observations that cannot be trained sparsely
 
@@ -82,6 +84,7 @@ class SparsePolicyMixin(BasePolicy):
             sparsity_aware_init=sparsity_aware_init,
             mask_seed=mask_seed,
         )
+        import_named(kwargs)
         weight_decay = check_weight_decay(weight_decay, kwargs.get("optimizer_kwargs"))
         if "features_extractor_class" not in kwargs:
             kwargs["features_extractor_class"] = self.extractor_class or choose_extractor(

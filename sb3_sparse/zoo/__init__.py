@@ -1,1 +1,5 @@
-"""Training runs: settings that work, and what ``sb3-sparse train`` does with them."""
+"""Training runs in the manner of the RL zoo: configs, runs, and what they leave behind."""
+
+from sb3_sparse.zoo.configs import config_path
+
+__all__ = ["config_path"]

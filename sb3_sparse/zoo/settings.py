@@ -1,77 +1,162 @@
-"""Built-in settings: the RL zoo's tuned values for a few tasks, SB3's defaults for all others."""
+"""The settings of a run: a config's entry with what the user wants otherwise."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+import ast
+import inspect
+from collections.abc import Iterable, Mapping
+from difflib import get_close_matches
 from typing import Any
 
-from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from sb3_sparse.callback import SparsityCallback
+from sb3_sparse.errors import ConfigError
+from sb3_sparse.policies.aliases import SparsePolicy
+from sb3_sparse.topology import method_named
+
+POLICY = f"sb3_sparse.{SparsePolicy}"
+CALLBACK = f"sb3_sparse.{SparsityCallback.__name__}"
+# What rl-zoo reads itself, beside the arguments of the algorithm's constructor.
+ZOO_KEYS = frozenset(
+    ("callback", "env_kwargs", "env_wrapper", "frame_stack", "monitor_kwargs", "n_envs")
+    + ("n_timesteps", "noise_std", "noise_type", "normalize", "policy", "policy_kwargs")
+    + ("vec_env_wrapper",)
+)
 
 
-@dataclass(frozen=True)
-class Settings:
-    """How to train one algorithm on one task.
+def parse_overrides(texts: Iterable[str]) -> dict[str, Any]:
+    """``["learning_rate:0.001", ...]`` as rl-zoo's ``--hyperparams`` takes them.
 
-    :param n_timesteps: environment steps
-    :param n_envs: environments side by side
-    :param algorithm: arguments of the algorithm's constructor
-    :param policy: SB3's policy arguments
-    :param update_interval: gradient steps between two mask updates
-    :param drop_fraction: drop fraction at the first update
+    A value is a Python literal or ``dict(...)`` of literals; all else (``lin_0.001``, a dotted
+    path) is text.
+
+    :raises ConfigError: for a text without a colon
     """
-
-    n_timesteps: int
-    n_envs: int = 1
-    algorithm: Mapping[str, Any] = field(default_factory=dict)
-    policy: Mapping[str, Any] = field(default_factory=dict)
-    update_interval: int = 1000
-    drop_fraction: float = 0.5
-
-
-# Source of the tuned values: rl-baselines3-zoo 2.9, hyperparams/. Mask settings: arXiv:2206.10369,
-# tables of the best hyper-parameters (RigL).
-TUNED: Mapping[tuple[str, str], Settings] = {
-    ("dqn", "CartPole-v1"): Settings(
-        n_timesteps=50_000,
-        algorithm=dict(
-            learning_rate=2.3e-3,
-            batch_size=64,
-            buffer_size=100_000,
-            learning_starts=1000,
-            gamma=0.99,
-            target_update_interval=10,
-            train_freq=256,
-            gradient_steps=128,
-            exploration_fraction=0.16,
-            exploration_final_eps=0.04,
-        ),
-        policy=dict(net_arch=[256, 256]),
-    ),
-    ("ppo", "CartPole-v1"): Settings(
-        n_timesteps=100_000,
-        n_envs=8,
-        algorithm=dict(
-            n_steps=32,
-            batch_size=256,
-            gae_lambda=0.8,
-            gamma=0.98,
-            n_epochs=20,
-            ent_coef=0.0,
-            learning_rate=LinearSchedule(0.001, 0.0, 1.0),
-            clip_range=LinearSchedule(0.2, 0.0, 1.0),
-        ),
-        update_interval=250,
-        drop_fraction=0.3,
-    ),
-    ("sac", "Pendulum-v1"): Settings(n_timesteps=20_000, algorithm=dict(learning_rate=1e-3)),
-    ("sac", "HalfCheetah-v5"): Settings(
-        n_timesteps=1_000_000, algorithm=dict(learning_starts=10_000)
-    ),
-}
-DEFAULT = Settings(n_timesteps=100_000)
+    overrides: dict[str, Any] = {}
+    for text in texts:
+        name, colon, value = text.partition(":")
+        if not colon or not name or not value:
+            raise ConfigError(
+                f"hyperparameters are given as name:value, e.g. learning_rate:0.001, got {text!r}"
+            )
+        overrides[name] = _value(value)
+    return overrides
 
 
-def settings_for(algo: str, env_id: str) -> Settings:
-    """The tuned settings of a task, or SB3's defaults for 100,000 steps."""
-    return TUNED.get((algo, env_id), DEFAULT)
+class _DictCalls(ast.NodeTransformer):
+    """Turns ``dict(a=1)``, as the zoo's files write it, into ``{"a": 1}``."""
+
+    def visit_Call(self, node: ast.Call) -> ast.AST:
+        self.generic_visit(node)
+        if not (isinstance(node.func, ast.Name) and node.func.id == "dict") or node.args:
+            return node
+        keys: list[ast.expr | None] = [ast.Constant(keyword.arg) for keyword in node.keywords]
+        return ast.Dict(keys=keys, values=[keyword.value for keyword in node.keywords])
+
+
+def _value(text: str) -> Any:
+    try:
+        return ast.literal_eval(_DictCalls().visit(ast.parse(text.strip(), mode="eval")))
+    except (ValueError, SyntaxError):
+        return text
+
+
+def apply_overrides(
+    settings: dict[str, Any], overrides: Mapping[str, Any], algorithm: type[BaseAlgorithm]
+) -> None:
+    """Put each override where it belongs: callback, policy or algorithm; in place.
+
+    The names do not overlap, so ``update_interval``, ``weight_decay`` and ``learning_rate`` each
+    find their own place. A mapping given for a mapping (``policy_kwargs``) is merged into it.
+
+    :raises ConfigError: for a name that none of them has
+    """
+    of_callback = _arguments(SparsityCallback) - {"verbose"}
+    of_policy = _arguments(algorithm.policy_aliases[SparsePolicy]) - {"kwargs"}
+    of_algorithm = _arguments(algorithm) | ZOO_KEYS
+    for name, value in overrides.items():
+        if name in of_algorithm:
+            known = settings.get(name)
+            both = isinstance(known, Mapping) and isinstance(value, Mapping)
+            settings[name] = {**known, **value} if both and known else value
+        elif name in of_policy:
+            settings["policy_kwargs"] = {**policy_kwargs_of(settings), name: value}
+        elif name in of_callback:
+            sparsity_callback(settings, name)[name] = value
+        else:
+            known_names = of_algorithm | of_policy | of_callback
+            close = get_close_matches(name, known_names, n=1)
+            raise ConfigError(
+                f"{algorithm.__name__} has no hyperparameter {name!r}"
+                + (f"; did you mean {close[0]!r}?" if close else "")
+                + f" Of the algorithm: {_listed(of_algorithm)}. Of the policy: "
+                f"{_listed(of_policy)}. Of the mask's schedule: {_listed(of_callback)}"
+            )
+
+
+def _listed(names: Iterable[str]) -> str:
+    return ", ".join(sorted(names))
+
+
+def _arguments(cls: type) -> set[str]:
+    """Names that a class and its bases take when made, but those that every SB3 class is given."""
+    names: set[str] = set()
+    for base in cls.__mro__:
+        if "__init__" in vars(base) and base.__module__.split(".")[0] != "torch":
+            names.update(inspect.signature(vars(base)["__init__"]).parameters)
+    given = (
+        "self args kwargs env observation_space action_space lr_schedule supported_action_spaces"
+    )
+    return names - set(given.split()) - {"_init_setup_model", "support_multi_env"}
+
+
+def sparsity_callback(settings: Mapping[str, Any], wanted: str = "") -> dict[str, Any]:
+    """The arguments of the SparsityCallback in the settings, to read or to change.
+
+    :param wanted: what is to be set, for the message
+    :raises ConfigError: if there is no such callback
+    """
+    for callback in _callbacks(settings):
+        if isinstance(callback, dict) and CALLBACK in callback:
+            arguments: dict[str, Any] = callback[CALLBACK]
+            return arguments
+    raise ConfigError(f"{wanted} means nothing here: these settings train without {CALLBACK}")
+
+
+def method_of(settings: Mapping[str, Any]) -> str:
+    """The method that the settings train with.
+
+    :raises ConfigError: if their policy is not sparse, or they say contradictory things
+    """
+    policy = settings.get("policy")
+    if policy not in (POLICY, SparsePolicy):
+        raise ConfigError(
+            f"the policy must be {POLICY} (with sparsity 0.0 for dense training), got {policy!r}"
+        )
+    if any(isinstance(c, dict) and CALLBACK in c for c in _callbacks(settings)):
+        method = sparsity_callback(settings)["method"]
+        return method_named(method).name
+    sparsity = policy_kwargs_of(settings).get("sparsity")
+    return "dense" if sparsity == 0.0 else "static"
+
+
+def policy_kwargs_of(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """The policy's arguments in the settings.
+
+    :raises ConfigError: if they are no mapping
+    """
+    kwargs = settings.get("policy_kwargs", {})
+    if isinstance(kwargs, str):
+        kwargs = _value(kwargs)
+    if not isinstance(kwargs, dict):
+        raise ConfigError(
+            f"policy_kwargs must be a mapping of plain values, got {kwargs!r}; e.g. "
+            "{sparsity: 0.9, net_arch: [256, 256], activation_fn: torch.nn.ReLU}"
+        )
+    return kwargs
+
+
+def _callbacks(settings: Mapping[str, Any]) -> list[Any]:
+    callbacks = settings.get("callback") or []
+    return callbacks if isinstance(callbacks, list) else [callbacks]

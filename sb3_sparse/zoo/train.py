@@ -1,10 +1,12 @@
-"""One training run, from names to a saved model."""
+"""One training run, from names to a folder with model, evaluations and ``sparsity.json``."""
 
 from __future__ import annotations
 
+import importlib.util
 import os
-import sys
-from dataclasses import dataclass
+from collections.abc import Sequence
+from copy import deepcopy
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,75 +15,22 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.preprocessing import is_image_space
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
-from sb3_sparse.callback import SparsityCallback
-from sb3_sparse.errors import ConfigError
-from sb3_sparse.policies.aliases import SparsePolicy, supported_algorithms
+from sb3_sparse.errors import ConfigError, MissingExtra
 from sb3_sparse.policies.mixin import SparsePolicyMixin
-from sb3_sparse.sparsity.distributions import check_distribution, check_sparsity
-from sb3_sparse.topology import method_named, method_names
-from sb3_sparse.zoo.checkpoint import BestCheckpoint
-from sb3_sparse.zoo.settings import Settings, settings_for
+from sb3_sparse.zoo.checkpoint import Checkpoints, clear_checkpoints, last_checkpoint
+from sb3_sparse.zoo.evaluation import Evaluation
+from sb3_sparse.zoo.experiment import Experiment, spaces_of
+from sb3_sparse.zoo.match import match_parameters
+from sb3_sparse.zoo.record import read_record, sparsity_of, versions, write_record
+from sb3_sparse.zoo.run import Run
+from sb3_sparse.zoo.settings import method_of
 
-DENSE = "dense"
-
-
-@dataclass(frozen=True)
-class Run:
-    """What to train.
-
-    :param algo: algorithm, e.g. ``"sac"``
-    :param env_id: Gymnasium id
-    :param method: ``"dense"`` (stock SB3) or a topology method
-    :param sparsity: removed fraction, in [0, 1)
-    :param distribution: ``"erk"``, ``"er"`` or ``"uniform"``
-    :param seed: seed of everything
-    :param n_timesteps: environment steps; None: as the settings say
-    :raises ConfigError: for a name or value that is not allowed
-    """
-
-    algo: str = "dqn"
-    env_id: str = "CartPole-v1"
-    method: str = "rigl"
-    sparsity: float = 0.9
-    distribution: str = "erk"
-    seed: int = 0
-    n_timesteps: int | None = None
-
-    def __post_init__(self) -> None:
-        if self.algo not in algorithms():
-            raise ConfigError(
-                f"unknown algorithm {self.algo!r}; allowed are {', '.join(algorithms())} (tqc, "
-                "qrdqn, crossq and trpo need sb3-sparse[contrib])"
-            )
-        if self.env_id not in gym.registry:
-            raise ConfigError(
-                f"unknown environment {self.env_id!r}; give a Gymnasium id, e.g. CartPole-v1"
-            )
-        if self.method != DENSE and self.method not in method_names():
-            raise ConfigError(
-                f"unknown method {self.method!r}; allowed are {DENSE}, {', '.join(method_names())}"
-            )
-        check_sparsity(self.sparsity)
-        check_distribution(self.distribution)
-        if self.n_timesteps is not None and self.n_timesteps < 1:
-            raise ConfigError(f"the number of steps must be 1 or more, got {self.n_timesteps}")
-        if not 0 <= self.seed < 2**31:
-            raise ConfigError(f"the seed must lie in [0, 2^31), got {self.seed}")
-
-    @property
-    def settings(self) -> Settings:
-        """The built-in settings of this task."""
-        return settings_for(self.algo, self.env_id)
-
-    @property
-    def steps(self) -> int:
-        """Environment steps."""
-        return self.n_timesteps or self.settings.n_timesteps
+FINAL_EPISODES = 20
+EVALUATION_ENVS = 10
 
 
 @dataclass(frozen=True)
@@ -89,138 +38,212 @@ class Result:
     """What came out.
 
     :param what: which policy of the run
-    :param mean_return: mean episode return of the deterministic policy
+    :param mean_return: mean episode return
     :param std_return: its standard deviation over episodes
+    :param episodes: how many
     :param path: where the model lies
     """
 
     what: str
     mean_return: float
     std_return: float
+    episodes: int
     path: Path
 
 
-def algorithms() -> dict[str, type[BaseAlgorithm]]:
-    """Supported algorithms by lower-case name."""
-    return {name.lower(): algorithm for name, algorithm in supported_algorithms().items()}
+@dataclass(frozen=True)
+class Outcome:
+    """How a run ended.
 
-
-def make_model(run: Run, env: VecEnv, **kwargs: Any) -> tuple[BaseAlgorithm, list[BaseCallback]]:
-    """The model and the callbacks that the run needs.
-
-    :param kwargs: further arguments of the algorithm's constructor
+    :param folder: the run's folder
+    :param model: as it is now
+    :param results: of the last policy and the best one; empty if the run was stopped before its end
     """
-    settings = run.settings
-    policy_kwargs = dict(settings.policy)
-    callbacks: list[BaseCallback] = []
-    if run.method == DENSE:
-        policy = stock_policy(env.observation_space)
-    else:
-        policy = SparsePolicy
-        policy_kwargs.update(sparsity=run.sparsity, distribution=run.distribution)
-        method = method_named(run.method)
-        if method.reaches_final:
-            policy_kwargs["initial_sparsity"] = 0.0
-        options = {
-            name: getattr(settings, name)
-            for name in ("update_interval", "drop_fraction")
-            if name in method.options
-        }
-        callbacks.append(SparsityCallback(run.method, **options))
-    algorithm: Any = algorithms()[run.algo]
-    arguments = {**settings.algorithm, **kwargs}
-    model = algorithm(policy, env, seed=run.seed, policy_kwargs=policy_kwargs, **arguments)
-    return model, callbacks
 
+    folder: Path
+    model: BaseAlgorithm
+    results: tuple[Result, ...]
 
-def stock_policy(observation_space: spaces.Space[Any]) -> str:
-    """The name of SB3's own policy for these observations."""
-    if isinstance(observation_space, spaces.Dict):
-        return "MultiInputPolicy"
-    return "CnnPolicy" if is_image_space(observation_space) else "MlpPolicy"
-
-
-def make_env(run: Run) -> VecEnv:
-    """The run's environments, seeded.
-
-    :raises ConfigError: if the environment cannot be made or the algorithm cannot act in it
-    """
-    try:
-        env = make_vec_env(run.env_id, n_envs=run.settings.n_envs, seed=run.seed)
-    except gym.error.DependencyNotInstalled as error:
-        raise ConfigError(
-            f"{run.env_id} cannot be made: {error}; MuJoCo tasks need sb3-sparse[mujoco], Atari "
-            "games sb3-sparse[atari]"
-        ) from error
-    discrete_only = run.algo in ("dqn", "qrdqn")
-    box_only = run.algo in ("sac", "td3", "ddpg", "tqc", "crossq")
-    discrete = isinstance(env.action_space, spaces.Discrete)
-    if (discrete_only and not discrete) or (
-        box_only and not isinstance(env.action_space, spaces.Box)
-    ):
-        raise ConfigError(
-            f"{run.algo} cannot act in {run.env_id}, whose actions are {env.action_space}; "
-            + (
-                "take dqn, qrdqn, ppo, a2c or trpo"
-                if discrete
-                else "take sac, td3, tqc, crossq, ppo, a2c or trpo"
-            )
-        )
-    return env
-
-
-def evaluate(model: BaseAlgorithm, run: Run, episodes: int) -> tuple[float, float]:
-    """Mean and standard deviation of the deterministic policy's return on fresh environments."""
-    env = make_vec_env(run.env_id, n_envs=1, seed=run.seed + 10_000)
-    try:
-        mean, std = evaluate_policy(model, env, n_eval_episodes=episodes, deterministic=True)
-    finally:
-        env.close()
-    assert isinstance(mean, float)
-    assert isinstance(std, float)
-    return mean, std
+    @property
+    def finished(self) -> bool:
+        """Whether it came to its end."""
+        return bool(self.results)
 
 
 def train(
     run: Run,
-    log_folder: Path,
-    callbacks: list[BaseCallback],
-    episodes: int = 20,
-) -> tuple[BaseAlgorithm, list[Result]]:
-    """Train, save, evaluate the last policy and the best checkpoint.
+    log_folder: Path = Path("logs"),
+    callbacks: Sequence[BaseCallback] = (),
+    tensorboard_log: str = "",
+) -> Outcome:
+    """Train anew in ``log_folder/<algo>/<env>_<number>``.
 
-    The model is saved before it is evaluated, and as far as it came when training is interrupted.
+    SIGINT and SIGTERM stop it at the end of the current rollout; :func:`resume` goes on.
 
-    :param log_folder: a folder of its own is made below it, as the RL zoo names it:
-        ``<algo>/<env>_<number>``
     :param callbacks: further callbacks
-    :param episodes: episodes of the evaluation
+    :param tensorboard_log: where TensorBoard's files go; empty: none
+    :raises ConfigError: if the environment cannot be made or the algorithm cannot act in it
     """
-    env = make_env(run)
+    if tensorboard_log and importlib.util.find_spec("tensorboard") is None:
+        raise ConfigError("--tensorboard-log needs TensorBoard: pip install tensorboard")
+    settings = run.settings()
     try:
-        use_few_threads(env.observation_space)
-        model, own = make_model(run, env)
-        folder = new_run_folder(log_folder / run.algo, run.env_id)
-        path = folder / f"{run.env_id}.zip"
-        eval_env = make_vec_env(run.env_id, n_envs=1, seed=run.seed + 20_000)
-        best = BestCheckpoint(eval_env, folder)
-        try:
-            model.learn(run.steps, callback=[*own, *callbacks, best])
-        except KeyboardInterrupt:
-            print(
-                f"\nInterrupted after {model.num_timesteps} steps; saving {path}", file=sys.stderr
-            )
-            raise
-        finally:
-            model.save(path)
-            eval_env.close()
-        results = [Result("Last policy", *evaluate(model, run, episodes), path)]
-        if best.path.exists():
-            kept = type(model).load(best.path, device=model.device)
-            results.append(Result("Best checkpoint", *evaluate(kept, run, episodes), best.path))
+        observation_space, action_space = spaces_of(run, settings, log_folder / "x" / "x")
+    except gym.error.DependencyNotInstalled as error:
+        raise _missing(run, error) from error
+    check_action_space(run, action_space)
+    use_few_threads(observation_space)
+    record: dict[str, Any] = {}
+    if run.match_params is not None:
+        match = match_parameters(
+            run.algorithm, observation_space, action_space, settings, run.match_params
+        )
+        settings["policy_kwargs"] = match.policy_kwargs
+        record["match"] = asdict(match)
+    folder = new_run_folder(log_folder / run.algo, run.env_id.replace("/", "-"))
+    write_record(
+        folder,
+        status="running",
+        method=method_of(settings),
+        run=run.as_dict(),
+        settings=settings,
+        evaluation=run.evaluation(),
+        tensorboard_log=tensorboard_log,
+        versions=versions(),
+        **record,
+    )
+    return _learn(run, settings, folder, None, callbacks, tensorboard_log)
+
+
+def resume(folder: Path, callbacks: Sequence[BaseCallback] = ()) -> Outcome:
+    """Go on with an interrupted run from its last checkpoint, or from the start if it has none.
+
+    :param folder: the run's folder
+    :raises ConfigError: if there is no run, or it is finished
+    """
+    record = read_record(folder)
+    if record["status"] == "finished":
+        raise ConfigError(
+            f"the run in {folder} is finished; look at it with sb3-sparse enjoy {folder}, or train "
+            "longer anew with -n"
+        )
+    run = Run(**record["run"])
+    settings = record["settings"]
+    observation_space, _ = spaces_of(run, settings, folder)
+    use_few_threads(observation_space)
+    start = folder if record["status"] == "evaluating" else last_checkpoint(folder)
+    return _learn(run, settings, folder, start, callbacks, record["tensorboard_log"])
+
+
+def _learn(
+    run: Run,
+    settings: dict[str, Any],
+    folder: Path,
+    start: Path | None,
+    callbacks: Sequence[BaseCallback],
+    tensorboard_log: str,
+) -> Outcome:
+    experiment = Experiment(run, settings, folder, start, tensorboard_log)
+    model = experiment.setup()
+    policy = model.policy
+    assert isinstance(policy, SparsePolicyMixin)
+    schedule = run.evaluation()
+    envs = experiment.evaluation_envs(
+        min(EVALUATION_ENVS, schedule["eval_episodes"]), run.seed + 20_000
+    )
+    evaluation = Evaluation(
+        envs,
+        folder,
+        schedule["eval_freq"],
+        schedule["eval_episodes"],
+        experiment.deterministic_eval,
+        experiment.keep_normalization(),
+    )
+    checkpoints = Checkpoints(folder, experiment.env_name, evaluation)
+    if start is not None and start != folder:
+        checkpoints.restore(start)
+    done = model.num_timesteps
+    write_record(folder, status="running", num_timesteps=done, **sparsity_of(policy))
+    planned = experiment.n_timesteps
+    try:
+        if done < planned:
+            with checkpoints.on_signals():
+                model.learn(
+                    planned - done,
+                    callback=[*experiment.callbacks, evaluation, checkpoints, *callbacks],
+                    reset_num_timesteps=start is None,
+                    tb_log_name=f"{run.algo}_{folder.name}",
+                )
+        stopped = checkpoints.stopped
+        path = experiment.save(model)
+        status = "interrupted" if stopped else "evaluating"
+        write_record(
+            folder, status=status, num_timesteps=model.num_timesteps, **sparsity_of(policy)
+        )
+        if stopped:
+            return Outcome(folder, model, ())
+        results = final_results(run, model, path, envs, experiment.deterministic_eval)
     finally:
-        env.close()
-    return model, results
+        envs.close()
+        assert model.env is not None
+        model.env.close()
+    write_record(folder, status="finished", results=[asdict(result) for result in results])
+    clear_checkpoints(folder)
+    return Outcome(folder, model, results)
+
+
+def final_results(
+    run: Run, model: BaseAlgorithm, path: Path, envs: VecEnv, deterministic: bool
+) -> tuple[Result, ...]:
+    """Evaluate the last policy and the best one on episodes that neither was chosen by."""
+    if model.get_vec_normalize_env() is not None:
+        assert model.env is not None
+        sync_envs_normalization(model.env, envs)
+    results = [_evaluate("Last policy", run, model, path, envs, deterministic)]
+    best = path.with_name("best_model.zip")
+    if best.is_file():
+        last: Any = deepcopy(model.get_parameters())
+        model.set_parameters(str(best))
+        results.append(_evaluate("Best policy", run, model, best, envs, deterministic))
+        model.set_parameters(last)
+    return tuple(results)
+
+
+def _evaluate(
+    what: str, run: Run, model: BaseAlgorithm, path: Path, envs: VecEnv, deterministic: bool
+) -> Result:
+    envs.seed(run.seed + 10_000)
+    mean, std = evaluate_policy(
+        model, envs, n_eval_episodes=FINAL_EPISODES, deterministic=deterministic
+    )
+    assert isinstance(mean, float)
+    assert isinstance(std, float)
+    return Result(what, mean, std, FINAL_EPISODES, path)
+
+
+def _missing(run: Run, error: Exception) -> Exception:
+    if "mujoco" in str(error).lower():
+        return MissingExtra(run.env_id, "mujoco")
+    return ConfigError(f"{run.env_id} cannot be made: {error}")
+
+
+def check_action_space(run: Run, space: spaces.Space[Any]) -> None:
+    """Refuse an environment whose actions the algorithm cannot choose.
+
+    :raises ConfigError: if so
+    """
+    discrete = isinstance(space, spaces.Discrete)
+    discrete_only = run.algo in ("dqn", "qrdqn")
+    box_only = run.algo in ("sac", "td3", "ddpg", "tqc", "crossq")
+    if (discrete_only and not discrete) or (box_only and not isinstance(space, spaces.Box)):
+        others = (
+            "dqn, qrdqn, ppo, a2c or trpo"
+            if discrete
+            else "sac, td3, ddpg, tqc, crossq, ppo, a2c or trpo"
+        )
+        raise ConfigError(
+            f"{run.algo} cannot act in {run.env_id}, whose actions are {space}; take {others}"
+        )
 
 
 def use_few_threads(observation_space: spaces.Space[Any]) -> None:
@@ -228,23 +251,30 @@ def use_few_threads(observation_space: spaces.Space[Any]) -> None:
 
     ``OMP_NUM_THREADS`` decides where it is set.
     """
-    if "OMP_NUM_THREADS" not in os.environ and stock_policy(observation_space) == "MlpPolicy":
+    images = isinstance(observation_space, spaces.Dict) or is_image_space(observation_space)
+    if "OMP_NUM_THREADS" not in os.environ and not images:
         th.set_num_threads(1)
 
 
-def new_run_folder(parent: Path, env_id: str) -> Path:
+def new_run_folder(parent: Path, env_name: str) -> Path:
     """Make and return ``parent/<env>_<n>`` with the next free number."""
-    taken = [
-        int(number)
-        for folder in parent.glob(f"{env_id}_*")
-        if (number := folder.name.removeprefix(f"{env_id}_")).isdigit()
-    ]
-    folder = parent / f"{env_id}_{max(taken, default=0) + 1}"
-    folder.mkdir(parents=True)
-    return folder
+    parent.mkdir(parents=True, exist_ok=True)
+    while True:
+        taken = [
+            int(number)
+            for folder in parent.glob(f"{env_name}_*")
+            if (number := folder.name.removeprefix(f"{env_name}_")).isdigit()
+        ]
+        folder = parent / f"{env_name}_{max(taken, default=0) + 1}"
+        try:
+            folder.mkdir()
+        except FileExistsError:  # another run was quicker
+            continue
+        return folder
 
 
-def reached_sparsity(model: BaseAlgorithm) -> float | None:
-    """Sparsity of a model now; None if its policy is a stock one."""
+def reached_sparsity(model: BaseAlgorithm) -> float:
+    """Sparsity of a model now."""
     policy = model.policy
-    return policy.sparse.sparsity if isinstance(policy, SparsePolicyMixin) else None
+    assert isinstance(policy, SparsePolicyMixin)
+    return policy.sparse.sparsity

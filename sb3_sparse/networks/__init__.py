@@ -1,0 +1,6 @@
+"""Network architectures. They know nothing of masks."""
+
+from sb3_sparse.networks.impala import ImpalaCNN
+from sb3_sparse.networks.nature import ScaledNatureCNN
+
+__all__ = ["ImpalaCNN", "ScaledNatureCNN"]

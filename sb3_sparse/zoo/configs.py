@@ -1,0 +1,93 @@
+"""The YAML files with the settings of every method and algorithm."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from pathlib import Path
+from typing import Any
+
+from sb3_sparse.errors import ConfigError, MissingExtra
+
+try:
+    import yaml
+except ImportError as error:
+    raise MissingExtra("reading configs", "zoo") from error
+
+PACKAGE = Path(__file__).parent.parent
+ROOTS = (PACKAGE / "zoo_hparams", PACKAGE.parent / "zoo_hparams")  # in a wheel; in a clone
+METHODS = ("dense", "prune", "static", "set", "rigl")
+
+
+def config_root() -> Path:
+    """The folder that holds the shipped configs."""
+    return next(root for root in ROOTS if root.is_dir())
+
+
+def config_path(method: str, algo: str) -> Path:
+    """The YAML file of a method and an algorithm, in rl-zoo's form.
+
+    :param method: ``"dense"``, ``"prune"``, ``"static"``, ``"set"`` or ``"rigl"``
+    :param algo: algorithm, e.g. ``"sac"``, or another name in that folder, e.g. ``"dqn_impala"``
+    :raises ConfigError: if none is shipped
+    """
+    if method not in METHODS:
+        raise ConfigError(
+            f"no config is shipped for method {method!r}, only for {', '.join(METHODS)}; write "
+            "one and give it as --conf-file (docs/configs.md)"
+        )
+    path = config_root() / method / f"{algo}.yml"
+    if not path.is_file():
+        names = ", ".join(sorted(file.stem for file in path.parent.glob("*.yml")))
+        raise ConfigError(
+            f"no config is shipped for {algo!r}, only for {names}; write one and give it as "
+            "--conf-file (docs/configs.md)"
+        )
+    return path
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """The mapping in a YAML file.
+
+    :raises ConfigError: if there is no such file, or no mapping in it
+    """
+    if not path.is_file():
+        raise ConfigError(f"there is no config file {path}")
+    try:
+        content = yaml.safe_load(path.read_text())
+    except yaml.YAMLError as error:
+        raise ConfigError(f"{path} is no valid YAML: {error}") from error
+    if not isinstance(content, dict):
+        raise ConfigError(f"{path} must map environment ids to settings, got {content!r}")
+    return content
+
+
+def entry_of(path: Path, env_id: str, atari: bool) -> dict[str, Any]:
+    """The settings of an environment, looked up as rl-zoo does; a copy of one's own.
+
+    :param path: YAML file
+    :param env_id: environment
+    :param atari: whether it is an Atari game, which ``atari`` serves
+    :raises ConfigError: if the file has nothing for this environment
+    """
+    content = read_yaml(path)
+    shared = "atari" if atari else "default"
+    key = env_id if env_id in content else shared
+    if key not in content:
+        others = "Atari game" if atari else "environment"
+        raise ConfigError(
+            f"{path} has no settings for {env_id!r}; its keys are {', '.join(map(str, content))}. "
+            f"Add the key {env_id!r}, or `{shared}` for every {others} without a key of its own"
+        )
+    entry = content[key]
+    if not isinstance(entry, dict):
+        raise ConfigError(f"{key!r} in {path} must be a mapping of settings, got {entry!r}")
+    return deepcopy(entry)
+
+
+def evaluation_of(algo: str, env_id: str, atari: bool) -> dict[str, int]:
+    """How a run is evaluated: ``eval_freq`` (environment steps) and ``eval_episodes``."""
+    path = config_root() / "evaluation.yml"
+    content = read_yaml(path)
+    suite = content[algo if algo in content else "sac"]
+    shared = "atari" if atari else "default"
+    return {name: int(value) for name, value in suite.get(env_id, suite[shared]).items()}

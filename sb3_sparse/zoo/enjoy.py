@@ -1,0 +1,106 @@
+"""Watching and scoring what a run has trained."""
+
+from __future__ import annotations
+
+import importlib.util
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.utils import set_random_seed
+from stable_baselines3.common.vec_env import VecVideoRecorder
+
+from sb3_sparse.errors import ConfigError, MissingExtra
+from sb3_sparse.zoo.environments import is_atari, known_environment
+from sb3_sparse.zoo.experiment import load_for_prediction, quiet, test_env
+
+VIDEO_STEPS = 1000
+
+
+@dataclass(frozen=True)
+class Score:
+    """What an evaluation found.
+
+    :param model: file of the policy
+    :param mean_return: mean episode return
+    :param std_return: its standard deviation over episodes
+    :param episodes: how many
+    :param videos: the videos of this run
+    """
+
+    model: Path
+    mean_return: float
+    std_return: float
+    episodes: int
+    videos: tuple[Path, ...]
+
+
+def enjoy(
+    folder: Path, episodes: int = 20, best: bool = False, video: bool = False, seed: int = 0
+) -> Score:
+    """Evaluate a run's policy, deterministically (but for Atari games), as rl-zoo does.
+
+    :param folder: of a run, of ``sb3-sparse train`` or of ``rl_zoo3.train``
+    :param episodes: how many, 1 or more
+    :param best: the best policy instead of the last
+    :param video: record the first 1000 steps in ``<folder>/videos``
+    :param seed: of the environment
+    :raises ConfigError: if there is no run or no such model in it
+    """
+    if episodes < 1:
+        raise ConfigError(f"episodes must be 1 or more, got {episodes}")
+    arguments = _arguments_of(folder)
+    algo, env_id = arguments["algo"], arguments["env"]
+    known_environment(env_id)
+    env_name = env_id.replace("/", "-")
+    path = folder / ("best_model.zip" if best else f"{env_name}.zip")
+    if not path.is_file():
+        models = ", ".join(sorted(file.name for file in folder.glob("*.zip"))) or "none"
+        raise ConfigError(
+            f"{folder} has no {path.name}; its models: {models}. A run that was killed has its "
+            "last policy only after sb3-sparse train --resume, its best one with --best"
+        )
+    if video and importlib.util.find_spec("moviepy") is None:
+        raise MissingExtra("recording a video", "video")
+    set_random_seed(seed)
+    env_kwargs: dict[str, Any] = dict(arguments.get("env_kwargs") or {})
+    if video:
+        env_kwargs["render_mode"] = "rgb_array"
+    with quiet():
+        env = test_env(env_id, folder / env_name, env_kwargs, seed)
+        model = load_for_prediction(algo, path)
+        if video:
+            env = VecVideoRecorder(
+                env,
+                str(folder / "videos"),
+                record_video_trigger=lambda step: step == 0,
+                video_length=VIDEO_STEPS,
+                name_prefix=path.stem,
+            )
+    try:
+        with quiet():
+            mean, std = evaluate_policy(
+                model, env, n_eval_episodes=episodes, deterministic=not is_atari(env_id)
+            )
+    finally:
+        with quiet():
+            env.close()
+    assert isinstance(mean, float)
+    assert isinstance(std, float)
+    videos = tuple(sorted((folder / "videos").glob(f"{path.stem}*"))) if video else ()
+    return Score(path, mean, std, episodes, videos)
+
+
+def _arguments_of(folder: Path) -> dict[str, Any]:
+    """What the run was started with, from the file that rl-zoo writes."""
+    files = list(folder.glob("*/args.yml"))
+    if len(files) != 1:
+        raise ConfigError(
+            f"there is no run in {folder}; give the run's own folder, e.g. "
+            "logs/sac/HalfCheetah-v5_1"
+        )
+    # rl-zoo writes Python objects into it
+    arguments = yaml.load(files[0].read_text(), Loader=yaml.UnsafeLoader)
+    return dict(arguments)

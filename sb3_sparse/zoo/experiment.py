@@ -1,0 +1,162 @@
+"""The run engine: rl_zoo3's ExperimentManager with the settings and callbacks of this package."""
+
+from __future__ import annotations
+
+import io
+from argparse import Namespace
+from collections import OrderedDict
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, redirect_stdout
+from copy import deepcopy
+from pathlib import Path
+from typing import Any
+
+from gymnasium import spaces
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_sparse.errors import MissingExtra
+from sb3_sparse.zoo.run import Run
+
+try:
+    from rl_zoo3.callbacks import SaveVecNormalizeCallback
+    from rl_zoo3.exp_manager import ExperimentManager
+    from rl_zoo3.utils import ALGOS, create_test_env, get_saved_hyperparams
+except ImportError as error:
+    raise MissingExtra("training runs", "zoo") from error
+
+
+class Experiment(ExperimentManager):
+    """Makes environments, model and files as ``rl_zoo3.train`` does, for given settings.
+
+    :param run: what to train
+    :param settings: the config's entry, as it shall be trained
+    :param folder: the run's own folder
+    :param start: folder with the model to go on with (a checkpoint, or ``folder``); None: train
+        anew
+    :param tensorboard_log: where TensorBoard's files go; empty: none
+    """
+
+    def __init__(
+        self,
+        run: Run,
+        settings: Mapping[str, Any],
+        folder: Path,
+        start: Path | None = None,
+        tensorboard_log: str = "",
+    ) -> None:
+        self.settings = settings
+        evaluation = run.evaluation()
+        steps = int(start.name) if start is not None and start != folder else 0
+        arguments = {
+            **run.as_dict(),
+            **evaluation,
+            "env": run.env_id,
+            "env_kwargs": None,
+            "log_folder": str(folder.parent.parent),
+            "tensorboard_log": tensorboard_log,
+        }
+        super().__init__(
+            Namespace(**arguments),
+            run.algo,
+            run.env_id,
+            str(folder.parent.parent),
+            tensorboard_log,
+            eval_freq=-1,  # create_callbacks leaves evaluation and checkpoints to train.py
+            save_freq=-1,
+            n_eval_episodes=evaluation["eval_episodes"],
+            seed=run.seed + steps,  # so that a resumed run does not repeat its beginning
+            verbose=0,
+            device=run.device,
+            config=str(run.config),
+        )
+        self.save_path = str(folder)
+        self.params_path = str(folder / self.env_name)
+        if start is not None:
+            self.trained_agent = str(start / f"{self.env_name}.zip")
+            self.continue_training = True
+            self.monitor_kwargs = {"override_existing": False}
+
+    def read_hyperparameters(self) -> tuple[dict[str, Any], OrderedDict[str, Any]]:
+        """The settings, in place of the YAML file that they came from."""
+        return deepcopy(dict(self.settings)), OrderedDict(sorted(deepcopy(self.settings).items()))
+
+    def setup(self) -> BaseAlgorithm:
+        """The model, new or as the checkpoint has it."""
+        with quiet():
+            made = self.setup_experiment()
+        assert made is not None  # it is only when optimizing hyperparameters
+        return made[0]
+
+    def save(self, model: BaseAlgorithm) -> Path:
+        """Save the model as rl-zoo does; where."""
+        with quiet():
+            self.save_trained_model(model)
+        return Path(self.save_path) / f"{self.env_name}.zip"
+
+    def evaluation_envs(self, count: int, seed: int) -> VecEnv:
+        """Environments of their own for evaluation, with training's normalisation."""
+        envs: VecEnv = self.create_envs(count, eval_env=True)
+        envs.seed(seed)
+        return envs
+
+    def keep_normalization(self) -> BaseCallback:
+        """Saves the normalisation beside a new best model."""
+        callback: BaseCallback = SaveVecNormalizeCallback(save_freq=1, save_path=self.params_path)
+        return callback
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Swallow what rl_zoo3 prints; if it fails, the error says more."""
+    with redirect_stdout(io.StringIO()):
+        yield
+
+
+def spaces_of(
+    run: Run, settings: Mapping[str, Any], folder: Path
+) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
+    """Observation and action space that the policy sees, wrappers and stacking included."""
+    experiment = Experiment(run, settings, folder)
+    with quiet():
+        hyperparams, _ = experiment.read_hyperparameters()
+        _, experiment.env_wrapper, _, experiment.vec_env_wrapper = (
+            experiment._preprocess_hyperparams(hyperparams)
+        )
+        envs = experiment.create_envs(1, no_log=True)
+    envs.close()
+    return envs.observation_space, envs.action_space
+
+
+def test_env(env_id: str, params: Path, env_kwargs: dict[str, Any], seed: int) -> VecEnv:
+    """One environment with the wrappers, stacking and normalisation of a finished run.
+
+    :param params: folder of the run's ``config.yml`` and normalisation
+    """
+    hyperparams, stats = get_saved_hyperparams(str(params))
+    env: VecEnv = create_test_env(
+        env_id,
+        stats_path=stats,
+        seed=seed,
+        should_render=False,
+        hyperparams=hyperparams,
+        env_kwargs={**hyperparams.pop("env_kwargs", {}), **env_kwargs},
+    )
+    return env
+
+
+def load_for_prediction(algo: str, path: Path) -> BaseAlgorithm:
+    """A saved model without its replay buffer."""
+    kwargs: dict[str, Any] = {}
+    algorithm = ALGOS[algo]
+    if issubclass(algorithm, OffPolicyAlgorithm):
+        kwargs = dict(
+            buffer_size=1,
+            optimize_memory_usage=False,
+            replay_buffer_class=None,
+            replay_buffer_kwargs={},
+        )
+    model: BaseAlgorithm = algorithm.load(path, **kwargs)
+    return model

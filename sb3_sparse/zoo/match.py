@@ -1,0 +1,116 @@
+"""The dense network with as many parameters as a sparse one has."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from copy import deepcopy
+from dataclasses import dataclass
+from typing import Any
+
+from gymnasium import spaces
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.preprocessing import is_image_space
+
+from sb3_sparse.errors import ConfigError
+from sb3_sparse.policies.aliases import SparsePolicy
+from sb3_sparse.policies.mixin import SparsePolicyMixin
+from sb3_sparse.sparsity.widths import equivalent_widths
+
+EXTRACTOR = "features_extractor_class"
+EXTRACTOR_KWARGS = "features_extractor_kwargs"
+
+
+@dataclass(frozen=True)
+class Match:
+    """The outcome.
+
+    :param sparsity: whose parameter count was matched
+    :param target: that count: active connections and biases
+    :param achieved: parameters of the dense network
+    :param policy_kwargs: the policy's arguments with the scaled widths
+    """
+
+    sparsity: float
+    target: int
+    achieved: int
+    policy_kwargs: dict[str, Any]
+
+
+def match_parameters(
+    algorithm: type[BaseAlgorithm],
+    observation_space: spaces.Space[Any],
+    action_space: spaces.Space[Any],
+    settings: Mapping[str, Any],
+    sparsity: float,
+) -> Match:
+    """Scale all hidden widths (channels and dense units of an image network too) by one factor.
+
+    :param settings: of the dense network in full width
+    :param sparsity: of the network to match, in [0, 1)
+    :raises ConfigError: if the settings do not say how wide the network is
+    """
+    kwargs = _with_widths(settings["policy_kwargs"], observation_space)
+    hidden = [place.get() for place in _places(kwargs)]
+
+    def parameters(changed: dict[str, Any]) -> int:
+        policy_class: Any = algorithm.policy_aliases[SparsePolicy]
+        if settings.get("use_sde"):
+            changed = {**changed, "use_sde": True}
+        policy = policy_class(
+            observation_space, action_space, BasePolicy._dummy_schedule, **deepcopy(changed)
+        )
+        assert isinstance(policy, SparsePolicyMixin)
+        return policy.sparsity_report().parameters
+
+    def scaled(widths: list[int]) -> dict[str, Any]:
+        changed = deepcopy(kwargs)
+        for place, width in zip(_places(changed), widths, strict=True):
+            place.set(width)
+        return changed
+
+    target = parameters({**kwargs, "sparsity": sparsity})
+    widths, achieved = equivalent_widths(hidden, lambda w: parameters(scaled(w)), target)
+    return Match(sparsity, target, achieved, scaled(widths))
+
+
+def _with_widths(policy_kwargs: Mapping[str, Any], space: spaces.Space[Any]) -> dict[str, Any]:
+    """The arguments with every width written out."""
+    kwargs = deepcopy(dict(policy_kwargs))
+    if "net_arch" not in kwargs:
+        raise ConfigError(
+            "matching parameters needs the widths of the network; give them, e.g. --hyperparams "
+            "net_arch:[256,256]"
+        )
+    if is_image_space(space):
+        kwargs.setdefault(EXTRACTOR, "sb3_sparse.networks.ScaledNatureCNN")
+        given = kwargs.get(EXTRACTOR_KWARGS, {})
+        kwargs[EXTRACTOR_KWARGS] = {"channels": [32, 64, 64], "features_dim": 512, **given}
+    return kwargs
+
+
+@dataclass(frozen=True)
+class _Place:
+    """Where one width stands in the arguments."""
+
+    get: Callable[[], int]
+    set: Callable[[int], None]
+
+
+def _places(kwargs: dict[str, Any]) -> Iterator[_Place]:
+    """Every hidden width: of net_arch, then channels and dense units of an image network."""
+    arch = kwargs["net_arch"]
+    extractor = kwargs.get(EXTRACTOR_KWARGS, {})
+    lists = list(arch.values()) if isinstance(arch, dict) else [arch]
+    for widths in [*lists, extractor.get("channels", [])]:
+        for index in range(len(widths)):
+            yield _place(widths, index)
+    if "features_dim" in extractor:
+        yield _place(extractor, "features_dim")
+
+
+def _place(container: Any, key: Any) -> _Place:
+    def put(width: int) -> None:
+        container[key] = width
+
+    return _Place(get=lambda: int(container[key]), set=put)

@@ -1,0 +1,92 @@
+"""``sparsity.json``: what a run was asked for, what came out, and how sparse it is."""
+
+from __future__ import annotations
+
+import json
+import platform
+from collections.abc import Mapping
+from dataclasses import asdict
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from sb3_sparse.errors import ConfigError
+from sb3_sparse.policies.mixin import SparsePolicyMixin
+
+NAME = "sparsity.json"
+FORMAT = 1
+PACKAGES = (
+    "sb3-sparse",
+    "stable-baselines3",
+    "sb3-contrib",
+    "rl_zoo3",
+    "torch",
+    "gymnasium",
+    "numpy",
+)
+
+
+def write_record(folder: Path, **content: Any) -> None:
+    """Write the file, whole or not at all. What it had under other names stays."""
+    path = folder / NAME
+    known = json.loads(path.read_text()) if path.is_file() else {"format": FORMAT}
+    new = path.with_suffix(".new")
+    new.write_text(json.dumps({**known, **content}, indent=1, default=_plain) + "\n")
+    new.replace(path)
+
+
+def read_record(folder: Path) -> dict[str, Any]:
+    """The content of a run's file.
+
+    :raises ConfigError: if the folder has none, or it is damaged
+    """
+    path = folder / NAME
+    if not path.is_file():
+        raise ConfigError(
+            f"there is no run of sb3-sparse in {folder} (it would hold {NAME}); give the run's own "
+            "folder, e.g. logs/sac/HalfCheetah-v5_1"
+        )
+    try:
+        content: dict[str, Any] = json.loads(path.read_text())
+    except json.JSONDecodeError as error:
+        raise ConfigError(f"{path} is damaged: {error}") from error
+    return content
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, type):
+        return f"{value.__module__}.{value.__qualname__}"  # which a policy can import again
+    if isinstance(value, Mapping):
+        return dict(value)
+    return str(value)
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and of every package that decides about a run."""
+    found = {"python": platform.python_version()}
+    for package in PACKAGES:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def sparsity_of(policy: SparsePolicyMixin) -> dict[str, Any]:
+    """Counts of a policy as it is now: in total, by network and layer by layer."""
+    report = policy.sparsity_report()
+    networks = dict.fromkeys(layer.network for layer in report.layers)
+    return {
+        "total": {
+            "sparsity": report.sparsity(),
+            "nnz": report.nnz,
+            "parameters": report.parameters,
+            "flops": sum(layer.flops for layer in report.layers),
+            "dense_flops": sum(layer.dense_flops for layer in report.layers),
+        },
+        "networks": {name: {"sparsity": report.sparsity(name)} for name in networks},
+        "layers": [
+            {**asdict(layer), "size": layer.size, "density": layer.density}
+            for layer in report.layers
+        ],
+    }

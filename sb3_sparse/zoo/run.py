@@ -1,0 +1,147 @@
+"""What to train: names and numbers, checked when made."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from sb3_sparse.errors import ConfigError
+from sb3_sparse.policies.aliases import supported_algorithms
+from sb3_sparse.sparsity.distributions import check_distribution, check_sparsity
+from sb3_sparse.zoo.configs import config_path, entry_of, evaluation_of
+from sb3_sparse.zoo.environments import is_atari, known_environment
+from sb3_sparse.zoo.settings import apply_overrides, method_of, policy_kwargs_of
+
+DENSE = "dense"
+
+
+@dataclass(frozen=True)
+class Run:
+    """One training run. What is None is as the config says.
+
+    :param algo: algorithm, e.g. ``"sac"``
+    :param env_id: Gymnasium id
+    :param method: ``"dense"`` or a topology method; None: as ``conf_file`` says, else RigL
+    :param sparsity: removed fraction, in [0, 1)
+    :param distribution: ``"erk"``, ``"er"`` or ``"uniform"``
+    :param seed: seed of everything
+    :param n_timesteps: environment steps
+    :param n_envs: environments side by side
+    :param device: as in SB3
+    :param hyperparams: what else shall differ from the config, by name; of the algorithm, the
+        policy, the mask's schedule or rl-zoo
+    :param conf_file: a YAML file of one's own in rl-zoo's form, or the name of another shipped one,
+        e.g. ``"dqn_impala"``; None: the shipped one of the method and the algorithm
+    :param match_params: train the dense network that has as many parameters as this sparsity leaves
+    :param eval_freq: environment steps between two evaluations
+    :param eval_episodes: episodes of one evaluation
+    :raises ConfigError: for a name or value that is not allowed
+    """
+
+    algo: str = "dqn"
+    env_id: str = "CartPole-v1"
+    method: str | None = None
+    sparsity: float | None = None
+    distribution: str | None = None
+    seed: int = 0
+    n_timesteps: int | None = None
+    n_envs: int | None = None
+    device: str = "auto"
+    hyperparams: Mapping[str, Any] = field(default_factory=dict)
+    conf_file: str | None = None
+    match_params: float | None = None
+    eval_freq: int | None = None
+    eval_episodes: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.algo not in algorithms():
+            raise ConfigError(
+                f"unknown algorithm {self.algo!r}; allowed are {', '.join(algorithms())} (tqc, "
+                "qrdqn, crossq and trpo need sb3-sparse[contrib])"
+            )
+        known_environment(self.env_id)
+        if self.sparsity is not None:
+            check_sparsity(self.sparsity)
+        if self.distribution is not None:
+            check_distribution(self.distribution)
+        for name in ("n_timesteps", "n_envs", "eval_freq", "eval_episodes"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ConfigError(f"{name} must be 1 or more, got {value}")
+        if not 0 <= self.seed < 2**31:
+            raise ConfigError(f"the seed must lie in [0, 2^31), got {self.seed}")
+        if self.match_params is not None:
+            check_sparsity(self.match_params, "match_params")
+        self.settings()
+
+    @property
+    def algorithm(self) -> type[BaseAlgorithm]:
+        """The algorithm's class."""
+        return algorithms()[self.algo]
+
+    @property
+    def config(self) -> Path:
+        """The YAML file that the settings come from."""
+        if self.conf_file is not None and _is_path(self.conf_file):
+            return Path(self.conf_file)
+        return config_path(self.method or "rigl", self.conf_file or self.algo)
+
+    def settings(self) -> dict[str, Any]:
+        """The config's entry, with everything that this run wants otherwise.
+
+        :raises ConfigError: if the config has none, or if things contradict each other
+        """
+        settings = entry_of(self.config, self.env_id, is_atari(self.env_id))
+        settings["policy_kwargs"] = policy_kwargs_of(settings)
+        method = method_of(settings)
+        if self.method not in (None, method):
+            raise ConfigError(
+                f"{self.config} trains with method {method!r}, not {self.method!r}; leave --method "
+                "out, or change the file"
+            )
+        if method == DENSE and self.sparsity is not None:
+            raise ConfigError(
+                "dense training has no sparsity; leave --sparsity out, or give --match-params "
+                f"{self.sparsity} for the dense network of equal parameter count"
+            )
+        if method != DENSE and self.match_params is not None:
+            raise ConfigError(
+                f"--match-params is for --method dense, not {method!r}: it trains the dense "
+                "network that has as many parameters as the sparse one"
+            )
+        wanted = {
+            name: getattr(self, name)
+            for name in ("sparsity", "distribution", "n_timesteps", "n_envs")
+            if getattr(self, name) is not None
+        }
+        apply_overrides(settings, {**self.hyperparams, **wanted}, self.algorithm)
+        if "n_timesteps" not in settings:
+            raise ConfigError(
+                f"the settings of {self.env_id} in {self.config} lack n_timesteps; add it there or "
+                "give -n"
+            )
+        settings["n_timesteps"] = int(settings["n_timesteps"])
+        return settings
+
+    def evaluation(self) -> dict[str, int]:
+        """``eval_freq`` and ``eval_episodes``."""
+        schedule = evaluation_of(self.algo, self.env_id, is_atari(self.env_id))
+        given = {name: getattr(self, name) for name in schedule}
+        return {name: given[name] or value for name, value in schedule.items()}
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, from which ``Run(**values)`` makes the same run."""
+        return {**asdict(self), "hyperparams": dict(self.hyperparams)}
+
+
+def _is_path(text: str) -> bool:
+    return Path(text).suffix in (".yml", ".yaml") or Path(text).is_file()
+
+
+def algorithms() -> dict[str, type[BaseAlgorithm]]:
+    """Supported algorithms by lower-case name."""
+    return {name.lower(): algorithm for name, algorithm in supported_algorithms().items()}
