@@ -133,7 +133,8 @@ class SparsityCallback(BaseCallback):
 
     def _warn_if_nothing_was_due(self) -> None:
         sparse = self._sparse_policy().sparse
-        if self.plan.topology.options and sparse.updates_due == 0:
+        never_moved = not any(network.mask_updates for network in sparse.networks)
+        if self.plan.topology.options and sparse.updates_due == 0 and never_moved:
             warnings.warn(
                 f"{self.plan.method!r} had no mask update, so this was static training: the "
                 f"networks have made {', '.join(str(n.clock) for n in sparse.networks)} gradient "

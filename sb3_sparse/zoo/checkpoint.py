@@ -16,6 +16,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_sparse.zoo.evaluation import NPZ, Evaluation
+from sb3_sparse.zoo.record import write_record
 
 FOLDER = "resume"
 STATE = "state.json"
@@ -73,6 +74,7 @@ class Checkpoints(BaseCallback):
             shutil.copy(self.evaluation.folder / NPZ, new / NPZ)
         (new / STATE).write_text(json.dumps(self.evaluation.state()))
         new.rename(final)
+        write_record(self.parent_folder.parent, num_timesteps=self.model.num_timesteps)
         for other in self.parent_folder.iterdir():
             if other != final:
                 shutil.rmtree(other)

@@ -98,7 +98,8 @@ class Experiment(ExperimentManager):
 
     def evaluation_envs(self, count: int, seed: int) -> VecEnv:
         """Environments of their own for evaluation, with training's normalisation."""
-        envs: VecEnv = self.create_envs(count, eval_env=True)
+        with quiet():
+            envs: VecEnv = self.create_envs(count, eval_env=True)
         envs.seed(seed)
         return envs
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import importlib.util
 import os
-from collections.abc import Sequence
-from copy import deepcopy
-from dataclasses import asdict, dataclass
+import shutil
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -15,59 +16,20 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.preprocessing import is_image_space
-from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
-from sb3_sparse.errors import ConfigError, MissingExtra
+from sb3_sparse.errors import ConfigError, MissingExtra, SparsityError
 from sb3_sparse.policies.mixin import SparsePolicyMixin
 from sb3_sparse.zoo.checkpoint import Checkpoints, clear_checkpoints, last_checkpoint
 from sb3_sparse.zoo.evaluation import Evaluation
 from sb3_sparse.zoo.experiment import Experiment, spaces_of
 from sb3_sparse.zoo.match import match_parameters
 from sb3_sparse.zoo.record import read_record, sparsity_of, versions, write_record
+from sb3_sparse.zoo.results import Outcome, final_results
 from sb3_sparse.zoo.run import Run
 from sb3_sparse.zoo.settings import method_of
 
-FINAL_EPISODES = 20
 EVALUATION_ENVS = 10
-
-
-@dataclass(frozen=True)
-class Result:
-    """What came out.
-
-    :param what: which policy of the run
-    :param mean_return: mean episode return
-    :param std_return: its standard deviation over episodes
-    :param episodes: how many
-    :param path: where the model lies
-    """
-
-    what: str
-    mean_return: float
-    std_return: float
-    episodes: int
-    path: Path
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """How a run ended.
-
-    :param folder: the run's folder
-    :param model: as it is now
-    :param results: of the last policy and the best one; empty if the run was stopped before its end
-    """
-
-    folder: Path
-    model: BaseAlgorithm
-    results: tuple[Result, ...]
-
-    @property
-    def finished(self) -> bool:
-        """Whether it came to its end."""
-        return bool(self.results)
 
 
 def train(
@@ -87,10 +49,8 @@ def train(
     if tensorboard_log and importlib.util.find_spec("tensorboard") is None:
         raise ConfigError("--tensorboard-log needs TensorBoard: pip install tensorboard")
     settings = run.settings()
-    try:
-        observation_space, action_space = spaces_of(run, settings, log_folder / "x" / "x")
-    except gym.error.DependencyNotInstalled as error:
-        raise _missing(run, error) from error
+    with explained(run):
+        observation_space, action_space = spaces_of(run, settings, log_folder / run.algo / "new")
     check_action_space(run, action_space)
     use_few_threads(observation_space)
     record: dict[str, Any] = {}
@@ -112,7 +72,14 @@ def train(
         versions=versions(),
         **record,
     )
-    return _learn(run, settings, folder, None, callbacks, tensorboard_log)
+    try:
+        with explained(run):
+            experiment = Experiment(run, settings, folder, None, tensorboard_log)
+            model = experiment.setup()
+    except Exception:
+        shutil.rmtree(folder)  # nothing was trained
+        raise
+    return _learn(run, experiment, model, folder, None, callbacks)
 
 
 def resume(folder: Path, callbacks: Sequence[BaseCallback] = ()) -> Outcome:
@@ -132,19 +99,18 @@ def resume(folder: Path, callbacks: Sequence[BaseCallback] = ()) -> Outcome:
     observation_space, _ = spaces_of(run, settings, folder)
     use_few_threads(observation_space)
     start = folder if record["status"] == "evaluating" else last_checkpoint(folder)
-    return _learn(run, settings, folder, start, callbacks, record["tensorboard_log"])
+    experiment = Experiment(run, settings, folder, start, record["tensorboard_log"])
+    return _learn(run, experiment, experiment.setup(), folder, start, callbacks)
 
 
 def _learn(
     run: Run,
-    settings: dict[str, Any],
+    experiment: Experiment,
+    model: BaseAlgorithm,
     folder: Path,
     start: Path | None,
     callbacks: Sequence[BaseCallback],
-    tensorboard_log: str,
 ) -> Outcome:
-    experiment = Experiment(run, settings, folder, start, tensorboard_log)
-    model = experiment.setup()
     policy = model.policy
     assert isinstance(policy, SparsePolicyMixin)
     schedule = run.evaluation()
@@ -187,44 +153,29 @@ def _learn(
         envs.close()
         assert model.env is not None
         model.env.close()
-    write_record(folder, status="finished", results=[asdict(result) for result in results])
+    write_record(
+        folder, status="finished", results=[{**asdict(r), "path": r.path.name} for r in results]
+    )
     clear_checkpoints(folder)
     return Outcome(folder, model, results)
 
 
-def final_results(
-    run: Run, model: BaseAlgorithm, path: Path, envs: VecEnv, deterministic: bool
-) -> tuple[Result, ...]:
-    """Evaluate the last policy and the best one on episodes that neither was chosen by."""
-    if model.get_vec_normalize_env() is not None:
-        assert model.env is not None
-        sync_envs_normalization(model.env, envs)
-    results = [_evaluate("Last policy", run, model, path, envs, deterministic)]
-    best = path.with_name("best_model.zip")
-    if best.is_file():
-        last: Any = deepcopy(model.get_parameters())
-        model.set_parameters(str(best))
-        results.append(_evaluate("Best policy", run, model, best, envs, deterministic))
-        model.set_parameters(last)
-    return tuple(results)
-
-
-def _evaluate(
-    what: str, run: Run, model: BaseAlgorithm, path: Path, envs: VecEnv, deterministic: bool
-) -> Result:
-    envs.seed(run.seed + 10_000)
-    mean, std = evaluate_policy(
-        model, envs, n_eval_episodes=FINAL_EPISODES, deterministic=deterministic
-    )
-    assert isinstance(mean, float)
-    assert isinstance(std, float)
-    return Result(what, mean, std, FINAL_EPISODES, path)
-
-
-def _missing(run: Run, error: Exception) -> Exception:
-    if "mujoco" in str(error).lower():
-        return MissingExtra(run.env_id, "mujoco")
-    return ConfigError(f"{run.env_id} cannot be made: {error}")
+@contextmanager
+def explained(run: Run) -> Iterator[None]:
+    """Turn what environment, zoo and algorithm raise about wrong settings into our errors."""
+    try:
+        yield
+    except SparsityError:
+        raise
+    except gym.error.DependencyNotInstalled as error:
+        if "mujoco" in str(error).lower():
+            raise MissingExtra(run.env_id, "mujoco") from error
+        raise ConfigError(f"{run.env_id} cannot be made: {error}") from error
+    except (TypeError, ValueError, AssertionError, AttributeError, ImportError) as error:
+        raise ConfigError(
+            f"the settings of {run.env_id} in {run.config}, with what you changed, do not work: "
+            f"{type(error).__name__}: {error}"
+        ) from error
 
 
 def check_action_space(run: Run, space: spaces.Space[Any]) -> None:

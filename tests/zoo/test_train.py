@@ -1,45 +1,275 @@
-"""One training run, called from Python."""
+"""Runs called from Python: what they leave behind, and going on after an interruption."""
 
 from __future__ import annotations
 
+import json
+import signal
+from dataclasses import replace
+
+import numpy as np
 import pytest
-from stable_baselines3 import DQN
+import torch as th
+from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from support import ALGORITHMS
 
 from sb3_sparse.errors import ConfigError
-from sb3_sparse.zoo.settings import DEFAULT, TUNED, settings_for
-from sb3_sparse.zoo.train import Run, algorithms, make_env, make_model, new_run_folder, train
+from sb3_sparse.zoo.checkpoint import last_checkpoint
+from sb3_sparse.zoo.enjoy import enjoy
+from sb3_sparse.zoo.record import read_record
+from sb3_sparse.zoo.run import Run, algorithms
+from sb3_sparse.zoo.train import new_run_folder, resume, train
+
+SMALL = {"net_arch": [16, 16], "batch_size": 16}
+QUICK = dict(eval_freq=200, eval_episodes=2)
+DQN_RUN = Run(
+    n_timesteps=1000,
+    hyperparams={**SMALL, "learning_starts": 50, "update_interval": 20},
+    **QUICK,
+)
+PPO_RUN = Run(
+    algo="ppo",
+    env_id="Pendulum-v1",
+    method="set",
+    n_timesteps=1024,
+    hyperparams={
+        "net_arch": {"pi": [8, 8], "vf": [8, 8]},
+        "n_steps": 128,
+        "update_interval": 20,
+        "drop_fraction": 0.3,
+    },
+    **QUICK,
+)
 
 
-class Interrupt(BaseCallback):
+class Stop(BaseCallback):
+    """What a user's Ctrl-C, or ``kill``, does at some step."""
+
+    def __init__(self, at: int, number: int = signal.SIGINT, times: int = 1) -> None:
+        super().__init__()
+        self.at, self.number, self.times = at, number, times
+
     def _on_step(self) -> bool:
-        if self.num_timesteps == 300:
-            raise KeyboardInterrupt
+        if self.num_timesteps == self.at:
+            for _ in range(self.times):
+                signal.raise_signal(self.number)
         return True
 
 
-def test_an_interrupted_run_leaves_its_model_behind(tmp_path):
-    with pytest.raises(KeyboardInterrupt):
-        train(Run(n_timesteps=1000), tmp_path, [Interrupt()])
-    model = DQN.load(tmp_path / "dqn" / "CartPole-v1_1" / "CartPole-v1.zip")
-    assert model.num_timesteps == 300
+def evaluations(folder):
+    with np.load(folder / "evaluations.npz") as saved:
+        return saved["timesteps"].tolist(), saved["results"]
 
 
-@pytest.mark.parametrize(("algo", "method"), [("ppo", "prune"), ("dqn", "prune"), ("ppo", "dense")])
-def test_the_best_checkpoint_is_pruned_and_one_of_ten(algo, method, tmp_path, monkeypatch):
-    evaluated = []
-    monkeypatch.setattr(
-        "stable_baselines3.common.callbacks.evaluate_policy",
-        lambda model, *args, **kwargs: (evaluated.append(model.num_timesteps), ([1.0], [1]))[1],
+def test_the_folder_is_the_zoos_plus_sparsity_json(tmp_path):
+    outcome = train(DQN_RUN, tmp_path)
+    folder = tmp_path / "dqn" / "CartPole-v1_1"
+    assert outcome.folder == folder
+    assert sorted(str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()) == [
+        "0.monitor.csv",
+        "CartPole-v1.zip",
+        "CartPole-v1/args.yml",
+        "CartPole-v1/command.txt",
+        "CartPole-v1/config.yml",
+        "best_model.zip",
+        "evaluations.npz",
+        "sparsity.json",
+    ]
+    timesteps, results = evaluations(folder)
+    assert timesteps == [200, 400, 600, 800, 1000]
+    assert results.shape == (5, 2)
+
+
+def test_sparsity_json_says_what_was_trained_and_how_sparse_it_is(tmp_path):
+    outcome = train(DQN_RUN, tmp_path)
+    record = json.loads((outcome.folder / "sparsity.json").read_text())
+    assert Run(**record["run"]) == DQN_RUN
+    assert (record["status"], record["method"], record["num_timesteps"]) == (
+        "finished",
+        "rigl",
+        1000,
     )
-    _, results = train(Run(algo, method=method, n_timesteps=2000), tmp_path, [])
-    assert 1 <= len(evaluated) <= 10
-    assert all(1600 < steps <= 2000 for steps in evaluated)
-    for result in results:
-        model = algorithms()[algo].load(result.path)
-        if method == "prune":
-            assert all(layer.nnz == layer.final_nnz for layer in model.policy.sparse.layers)
+    assert record["settings"]["policy_kwargs"]["net_arch"] == [16, 16]
+    assert record["evaluation"] == {"eval_freq": 200, "eval_episodes": 2}
+    assert [result["path"] for result in record["results"]] == ["CartPole-v1.zip", "best_model.zip"]
+    assert record["versions"]["torch"] == th.__version__
+    masks = [layer.mask() for layer in outcome.model.policy.sparse.layers]
+    shapes = [[16, 4], [16, 16], [2, 16]]
+    assert [layer["shape"] for layer in record["layers"]] == shapes
+    assert [layer["nnz"] for layer in record["layers"]] == [int(mask.sum()) for mask in masks]
+    nnz = sum(int(mask.sum()) for mask in masks)
+    total = record["total"]
+    assert total["nnz"] == nnz
+    assert total["parameters"] == nnz + 16 + 16 + 2
+    assert total["flops"] == 2 * nnz + (16 + 16 + 2) + (16 + 16)  # biases, activations
+    assert total["dense_flops"] == 2 * (64 + 256 + 32) + (16 + 16 + 2) + (16 + 16)
+    assert total["sparsity"] == pytest.approx(1 - nnz / 352)
+
+
+def test_the_best_policy_of_pruning_is_pruned(tmp_path):
+    run = Run(
+        method="prune", n_timesteps=1500, hyperparams={**SMALL, "update_interval": 20}, **QUICK
+    )
+    outcome = train(run, tmp_path)
+    assert len(evaluations(outcome.folder)[0]) == 7
+    best = DQN.load(outcome.folder / "best_model.zip")
+    assert best.num_timesteps > 0.8 * 1500
+    for model in (best, outcome.model):
+        assert all(layer.nnz == layer.final_nnz for layer in model.policy.sparse.layers)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(("run", "cls"), [(DQN_RUN, DQN), (PPO_RUN, PPO)])
+def test_a_stopped_run_goes_on_and_evaluates_every_point_once(run, cls, number, tmp_path):
+    handler = signal.getsignal(number)
+    stopped = train(run, tmp_path, [Stop(500, number)])
+    assert signal.getsignal(number) == handler
+    assert not stopped.finished
+    folder = stopped.folder
+    record = read_record(folder)
+    assert record["status"] == "interrupted"
+    assert 500 <= record["num_timesteps"] < 700
+    cls.load(folder / f"{run.env_id}.zip")
+    before = evaluations(folder)
+    assert before[0] == [t for t in range(200, 601, 200) if t <= record["num_timesteps"]]
+    checkpoint = last_checkpoint(folder)
+    saved = cls.load(checkpoint / f"{run.env_id}.zip")
+    if cls is DQN:
+        saved.load_replay_buffer(checkpoint / "replay_buffer.pkl")
+        assert saved.replay_buffer.size() == saved.num_timesteps
+    else:
+        assert saved.num_timesteps % 128 == 0  # whole rollouts, all learnt from
+
+    monitored = len((folder / "0.monitor.csv").read_text().splitlines())
+    first = Look()
+    done = resume(folder, [first])
+    assert done.finished
+    assert done.folder == folder
+    assert first.steps == saved.num_timesteps
+    assert first.clocks == [network.clock for network in saved.policy.sparse.networks]
+    for name, weight in saved.policy.state_dict().items():
+        assert th.equal(first.state[name], weight), name
+    after = evaluations(folder)
+    assert after[0] == list(range(200, run.n_timesteps + 1, 200))
+    assert (after[1][: len(before[0])] == before[1]).all()
+    assert len((folder / "0.monitor.csv").read_text().splitlines()) > monitored
+    assert read_record(folder)["status"] == "finished"
+    assert not (folder / "resume").exists()
+    assert done.model.num_timesteps >= run.n_timesteps
+    assert done.model._total_timesteps == run.n_timesteps
+    if cls is PPO:
+        assert done.model.get_vec_normalize_env().obs_rms.count > 1000
+    with pytest.raises(ConfigError, match="is finished"):
+        resume(folder)
+
+
+class Look(BaseCallback):
+    """What the model is when training begins."""
+
+    def _on_training_start(self) -> None:
+        policy = self.model.policy
+        self.steps = self.model.num_timesteps
+        self.clocks = [network.clock for network in policy.sparse.networks]
+        self.state = {name: value.clone() for name, value in policy.state_dict().items()}
+
+    def _on_step(self) -> bool:
+        return True
+
+
+def test_a_second_interrupt_stops_at_once_and_falls_back_to_the_last_evaluation(tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        train(DQN_RUN, tmp_path, [Stop(500, times=2)])
+    folder = tmp_path / "dqn" / "CartPole-v1_1"
+    assert read_record(folder)["status"] == "running"
+    assert last_checkpoint(folder).name == "400"
+    outcome = resume(folder)
+    assert outcome.finished
+    assert evaluations(folder)[0] == [200, 400, 600, 800, 1000]
+
+
+def test_a_run_that_died_before_its_first_evaluation_starts_again(tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        train(DQN_RUN, tmp_path, [Stop(100, times=2)])
+    folder = tmp_path / "dqn" / "CartPole-v1_1"
+    assert last_checkpoint(folder) is None
+    assert resume(folder).finished
+    assert evaluations(folder)[0] == [200, 400, 600, 800, 1000]
+
+
+def test_a_run_that_died_in_its_last_evaluation_only_does_that_again(tmp_path, monkeypatch):
+    def die(*args, **kwargs):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("sb3_sparse.zoo.train.final_results", die)
+    with pytest.raises(KeyboardInterrupt):
+        train(DQN_RUN, tmp_path)
+    monkeypatch.undo()
+    folder = tmp_path / "dqn" / "CartPole-v1_1"
+    steps = Look()
+    assert resume(folder, [steps]).finished
+    assert not hasattr(steps, "steps")  # never trained
+    assert evaluations(folder)[0] == [200, 400, 600, 800, 1000]
+
+
+def test_a_checkpoint_half_written_is_not_one(tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        train(DQN_RUN, tmp_path, [Stop(500, times=2)])
+    folder = tmp_path / "dqn" / "CartPole-v1_1"
+    (folder / "resume" / "unfinished").mkdir()
+    assert last_checkpoint(folder).name == "400"
+    assert resume(folder).finished
+
+
+def test_masks_move_after_a_resume_as_the_schedule_says(tmp_path):
+    run = replace(DQN_RUN, hyperparams={**DQN_RUN.hyperparams, "net_arch": [64, 64]})
+    stopped = train(run, tmp_path, [Stop(500)])
+    done = resume(stopped.folder)
+    # every 20 gradient steps, which begin after 50 steps of collecting; the last one or two have
+    # a drop fraction too small for a single connection
+    counts = [one.policy.sparse.networks[0].mask_updates for one in (stopped.model, done.model)]
+    assert counts[0] == (500 - 50) // 20
+    assert (0.8 * 1000 - 50) // 20 - 2 <= counts[1] <= (0.8 * 1000 - 50) // 20
+
+
+def test_a_dense_run_of_equal_parameters_says_what_it_reached(tmp_path):
+    run = Run(method="dense", match_params=0.9, n_timesteps=200, **QUICK)
+    outcome = train(run, tmp_path)
+    record = read_record(outcome.folder)
+    match = record["match"]
+    assert match["target"] == (2048 + 23451 + 1024) + 512 + 512 + 2  # the vector of 4-512-512-2
+    width, _ = outcome.model.policy.net_arch
+    assert match["achieved"] == record["total"]["parameters"]
+    assert match["achieved"] == 5 * width + (width + 1) * width + (width + 1) * 2
+    assert abs(match["achieved"] - match["target"]) < 170  # one unit more or less is twice that
+    assert record["total"]["sparsity"] == 0
+
+
+def test_tensorboard_goes_on_in_the_same_folder(tmp_path):
+    log = str(tmp_path / "tb")
+    stopped = train(DQN_RUN, tmp_path / "logs", [Stop(500)], tensorboard_log=log)
+    resume(stopped.folder)
+    folders = {path.parent for path in (tmp_path / "tb").rglob("*tfevents*")}
+    assert [folder.name for folder in folders] == ["dqn_CartPole-v1_1_1"]
+
+
+def test_noise_and_other_wrappers_come_from_the_settings(tmp_path):
+    wrapper = [{"sb3_sparse.wrappers.ObservationNoise": {"sigma": 0.1, "std": [1, 1, 1, 1]}}]
+    run = Run(n_timesteps=200, hyperparams={"env_wrapper": wrapper, **SMALL}, **QUICK)
+    outcome = train(run, tmp_path)
+    assert outcome.finished
+    assert enjoy(outcome.folder, episodes=2).episodes == 2
+
+
+def test_enjoy_scores_last_and_best_with_the_runs_normalization(tmp_path):
+    outcome = train(PPO_RUN, tmp_path)
+    for best, name in ((False, "Pendulum-v1.zip"), (True, "best_model.zip")):
+        score = enjoy(outcome.folder, episodes=3, best=best)
+        assert score.model == outcome.folder / name
+        assert -2000 < score.mean_return < 0
+        assert score.std_return > 0
+    (outcome.folder / "Pendulum-v1.zip").unlink()
+    with pytest.raises(ConfigError, match=r"has no Pendulum-v1.zip; its models: best_model.zip"):
+        enjoy(outcome.folder)
 
 
 def test_folders_are_numbered_on_and_never_shared(tmp_path):
@@ -50,26 +280,27 @@ def test_folders_are_numbered_on_and_never_shared(tmp_path):
     assert new_run_folder(tmp_path, "B-v1").name == "B-v1_1"
 
 
-@pytest.mark.parametrize("task", sorted(TUNED))
-def test_every_built_in_setting_makes_a_model(task):
-    algo, env_id = task
-    run = Run(algo=algo, env_id=env_id, method="prune")
-    env = make_env(run)
-    model, callbacks = make_model(run, env)
-    assert model.n_envs == run.settings.n_envs
-    assert callbacks[0].plan.update_interval == run.settings.update_interval
-    env.close()
-
-
-def test_other_tasks_get_the_defaults_of_sb3():
-    assert settings_for("sac", "Hopper-v5") is DEFAULT
-    assert not DEFAULT.algorithm
-
-
 def test_the_algorithms_are_those_with_a_sparse_policy():
     assert set(algorithms()) == {name.lower() for name in ALGORITHMS}
 
 
-def test_a_negative_seed_is_refused():
-    with pytest.raises(ConfigError, match="seed must lie in"):
-        Run(seed=-1)
+@pytest.mark.parametrize("method", ["dense", "prune", "static", "set", "rigl"])
+@pytest.mark.parametrize("algo", sorted(algorithms()))
+def test_every_method_and_algorithm_runs_by_its_config(method, algo, tmp_path):
+    discrete = algo in ("dqn", "qrdqn")
+    run = Run(
+        algo=algo,
+        env_id="CartPole-v1" if discrete else "Pendulum-v1",
+        method=method,
+        n_timesteps=64,
+        eval_freq=64,
+        eval_episodes=1,
+        hyperparams={"net_arch": [8, 8]}
+        | ({"n_steps": 8} if algo in ("ppo", "a2c", "trpo") else {"learning_starts": 8}),
+    )
+    outcome = train(run, tmp_path)
+    assert outcome.finished
+    policy = outcome.model.policy
+    kwargs = run.settings()["policy_kwargs"]
+    assert policy.sparsity_config.sparsity == kwargs["sparsity"]
+    assert policy.sparse.weight_decay == kwargs["weight_decay"]

@@ -1,0 +1,238 @@
+"""The shipped configs: the paper's tables, value by value, and settings that work."""
+
+from __future__ import annotations
+
+import gymnasium as gym
+import pytest
+import yaml
+from rl_zoo3.exp_manager import ExperimentManager
+from zoo import paper_tables as paper
+
+import sb3_sparse.zoo.configs as configs
+from sb3_sparse.errors import ConfigError
+from sb3_sparse.zoo import config_path
+from sb3_sparse.zoo.configs import METHODS, entry_of, evaluation_of
+from sb3_sparse.zoo.environments import is_atari
+from sb3_sparse.zoo.run import Run, algorithms
+from sb3_sparse.zoo.settings import CALLBACK, ZOO_KEYS, _arguments, method_of
+
+SHIPPED = sorted(configs.config_root().glob("*/*.yml"))
+MUJOCO_IDS = [f"{name}-{version}" for name in paper.MUJOCO for version in ("v5", "v4")]
+GAME_IDS = [f"{game}NoFrameskip-v4" for game in paper.GAMES]
+
+
+def entry(method, name, env_id):
+    return entry_of(config_path(method, name), env_id, is_atari(env_id))
+
+
+def assert_sparse_settings(settings, method, row):
+    """Compare with a row (weight decay, update interval, drop fraction, sparsity-aware init)."""
+    kwargs = settings["policy_kwargs"]
+    callback = settings["callback"][0][CALLBACK] if "callback" in settings else {}
+    found = (
+        kwargs["weight_decay"],
+        callback.get("update_interval"),
+        callback.get("drop_fraction"),
+        kwargs.get("sparsity_aware_init"),
+    )
+    assert found == row
+    assert method_of(settings) == method
+    assert kwargs["sparsity"] == (0.0 if method == "dense" else 0.9)
+    assert kwargs.get("initial_sparsity") == (0.0 if method == "prune" else None)
+
+
+def assert_has(settings, values):
+    assert {name: settings[name] for name in values} == values
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("env_id", paper.CLASSIC)
+def test_dqn_on_classic_control_is_as_in_the_tables(method, env_id):
+    settings = entry(method, "dqn", env_id)
+    assert_sparse_settings(settings, method, paper.DQN_SWEEP[method])
+    assert_has(settings, paper.DQN_CLASSIC)
+    assert settings["policy_kwargs"]["net_arch"] == paper.DQN_CLASSIC_WIDTHS
+    decay = settings["exploration_fraction"] * settings["n_timesteps"]
+    assert decay == pytest.approx(paper.EPSILON_DECAY_STEPS)
+    evaluation = evaluation_of("dqn", env_id, atari=False)
+    schedule = (settings["n_timesteps"], evaluation["eval_freq"], evaluation["eval_episodes"])
+    assert schedule == paper.CLASSIC_SCHEDULE
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("env_id", MUJOCO_IDS)
+def test_sac_on_mujoco_is_as_in_the_tables(method, env_id):
+    settings = entry(method, "sac", env_id)
+    assert_sparse_settings(settings, method, paper.SAC_SWEEP[method])
+    assert_has(settings, paper.SAC)
+    assert settings["policy_kwargs"]["net_arch"] == paper.SAC_WIDTHS
+    assert settings["learning_starts"] == paper.SAC_STARTS[env_id.split("-")[0]]
+    evaluation = evaluation_of("sac", env_id, atari=False)
+    schedule = (settings["n_timesteps"], evaluation["eval_freq"], evaluation["eval_episodes"])
+    assert schedule == paper.MUJOCO_SAC_SCHEDULE
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("env_id", MUJOCO_IDS)
+def test_ppo_on_mujoco_is_as_in_the_tables(method, env_id):
+    settings = entry(method, "ppo", env_id)
+    assert_sparse_settings(settings, method, paper.PPO_SWEEP[method])
+    assert_has(settings, paper.PPO)
+    assert settings["policy_kwargs"]["net_arch"] == paper.PPO_WIDTHS
+    evaluation = evaluation_of("ppo", env_id, atari=False)
+    schedule = (settings["n_timesteps"], evaluation["eval_freq"], evaluation["eval_episodes"])
+    assert schedule == paper.MUJOCO_PPO_SCHEDULE
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("env_id", GAME_IDS)
+@pytest.mark.parametrize(
+    ("name", "table", "learning"),
+    [
+        ("dqn", paper.ATARI_CNN, paper.CNN),
+        ("dqn_impala", paper.ATARI_RESNET, paper.RESNET),
+    ],
+)
+def test_dqn_on_atari_is_as_in_the_tables(method, env_id, name, table, learning):
+    settings = entry(method, name, env_id)
+    kwargs = settings["policy_kwargs"]
+    assert_sparse_settings(settings, method, table[method])
+    assert_has(settings, paper.DQN_ATARI)
+    assert (settings["learning_rate"], kwargs["optimizer_kwargs"]["eps"]) == learning
+    assert kwargs["net_arch"] == []
+    assert settings["frame_stack"] == 4
+    decay = settings["exploration_fraction"] * settings["n_timesteps"]
+    assert decay == pytest.approx(paper.EPSILON_DECAY_STEPS)
+    evaluation = evaluation_of("dqn", env_id, atari=True)
+    assert (settings["n_timesteps"], evaluation["eval_freq"]) == paper.ATARI_SCHEDULE
+    if name == "dqn_impala":
+        extractor = kwargs["features_extractor_kwargs"]
+        assert extractor["channels"] == paper.RESNET_FILTERS
+        assert extractor["features_dim"] == paper.DENSE_UNITS
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(
+    ("algos", "table", "without"),
+    [
+        (("td3", "ddpg", "tqc", "crossq"), paper.SAC_SWEEP, ()),
+        (("qrdqn",), paper.DQN_SWEEP, ("atari",)),
+        (("a2c", "trpo"), paper.PPO_SWEEP, ()),
+    ],
+)
+def test_other_algorithms_have_the_sparse_settings_of_their_kin(method, algos, table, without):
+    for algo in algos:
+        path = config_path(method, algo)
+        assert "Not in the paper" in path.read_text()
+        for key in yaml.safe_load(path.read_text()):
+            if key not in without:
+                settings = entry_of(path, key, atari=key == "atari")
+                assert_sparse_settings(settings, method, table[method])
+
+
+def comparable(settings, policy_kwargs):
+    """Without what makes it sparse; defaults that only say a width are left out too."""
+    ours = ("policy", "callback", "policy_kwargs")
+    kept = {name: value for name, value in settings.items() if name not in ours}
+    mine = ("sparsity", "initial_sparsity", "sparsity_aware_init", "weight_decay", "net_arch")
+    kept.update({k: v for k, v in policy_kwargs.items() if k not in mine})
+    return kept
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("algo", ["td3", "ddpg", "tqc", "crossq", "qrdqn", "a2c", "trpo"])
+def test_base_values_of_the_others_are_those_of_the_installed_zoo(method, algo):
+    path = config_path(method, algo)
+    import rl_zoo3
+
+    theirs = yaml.safe_load(
+        (configs.Path(rl_zoo3.__file__).parent / "hyperparams" / f"{algo}.yml").read_text()
+    )
+    for key in yaml.safe_load(path.read_text()):
+        base = theirs.get(key.replace("-v5", "-v4"), theirs["default"])
+        settings = entry_of(path, key, atari=key == "atari")
+        if key == "atari" and algo == "a2c":
+            base = {**base, "policy_kwargs": "dict()"}  # classes, which the file names by path
+            for name in ("optimizer_class", "optimizer_kwargs"):
+                settings["policy_kwargs"].pop(name)
+        kwargs = eval(base.get("policy_kwargs", "dict()"))
+        expected = comparable(base, kwargs)
+        assert comparable(settings, settings["policy_kwargs"]) == expected, key
+        if "net_arch" in kwargs:
+            assert settings["policy_kwargs"]["net_arch"] == kwargs["net_arch"]
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: f"{path.parent.name}/{path.stem}")
+def test_every_key_is_known_to_the_algorithm_the_policy_or_the_zoo(path):
+    algorithm = algorithms()[path.stem.split("_")[0]]
+    policy = _arguments(algorithm.policy_aliases["SparsePolicy"])
+    for key in yaml.safe_load(path.read_text()):
+        settings = entry_of(path, key, atari=key == "atari")
+        assert set(settings) <= _arguments(algorithm) | ZOO_KEYS, key
+        assert set(settings["policy_kwargs"]) <= policy, key
+        assert method_of(settings) == path.parent.name
+
+
+def test_every_method_has_every_algorithm():
+    names = {*algorithms(), "dqn_impala"}
+    assert {(p.parent.name, p.stem) for p in SHIPPED} == {(m, n) for m in METHODS for n in names}
+
+
+def test_our_lookup_is_that_of_the_zoo(tmp_path):
+    path = tmp_path / "mine.yml"
+    path.write_text("default: {a: 1}\natari: {a: 2}\nPongNoFrameskip-v4: {a: 3}\n")
+    for env_id in ("CartPole-v1", "QbertNoFrameskip-v4", "PongNoFrameskip-v4"):
+        atari = ExperimentManager.is_atari(env_id)
+        assert atari == is_atari(env_id)
+        manager = ExperimentManager(None, "dqn", env_id, str(tmp_path), config=str(path))
+        assert manager.read_hyperparameters()[0] == entry_of(path, env_id, atari)
+
+
+def test_an_environment_without_settings_says_which_file_which_keys_and_what_to_add(tmp_path):
+    path = tmp_path / "mine.yml"
+    path.write_text("Pendulum-v1: {n_timesteps: 5}\n")
+    with pytest.raises(ConfigError, match=r"mine\.yml has no settings for 'CartPole-v1'") as caught:
+        Run(conf_file=str(path))
+    assert "its keys are Pendulum-v1" in str(caught.value)
+    assert "`default` for every environment" in str(caught.value)
+    with pytest.raises(ConfigError, match="`atari` for every Atari game"):
+        Run(conf_file=str(path), env_id="PongNoFrameskip-v4")
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("[1, 2]", "must map environment ids"),
+        ("a: [", "no valid YAML"),
+        ("CartPole-v1: 3", "must be a mapping of settings"),
+        ("CartPole-v1: {policy: MlpPolicy}", "policy must be sb3_sparse.SparsePolicy"),
+        ("CartPole-v1: {policy: SparsePolicy, policy_kwargs: 'f()'}", "policy_kwargs must be a"),
+        ("CartPole-v1: {policy: SparsePolicy}", "lack n_timesteps"),
+    ],
+)
+def test_a_file_that_is_wrong_says_how(content, message, tmp_path):
+    path = tmp_path / "mine.yml"
+    path.write_text(content)
+    with pytest.raises(ConfigError, match=message):
+        Run(conf_file=str(path))
+
+
+def test_what_is_not_shipped_names_what_is(tmp_path):
+    with pytest.raises(ConfigError, match="only for a2c, crossq.*--conf-file"):
+        config_path("rigl", "reinforce")
+    with pytest.raises(ConfigError, match="only for dense, prune, static, set, rigl"):
+        config_path("gmp", "sac")
+    with pytest.raises(ConfigError, match="no config file"):
+        Run(conf_file=str(tmp_path / "none.yml"))
+
+
+def test_entries_are_copies():
+    first = entry("rigl", "sac", "Ant-v5")
+    first["policy_kwargs"]["sparsity"] = 0.1
+    assert entry("rigl", "sac", "Ant-v5")["policy_kwargs"]["sparsity"] == 0.9
+
+
+def test_all_environments_of_the_paper_exist():
+    Run(env_id="PongNoFrameskip-v4")  # registers the games
+    for env_id in (*paper.CLASSIC, *MUJOCO_IDS, *GAME_IDS):
+        assert env_id in gym.registry

@@ -1,0 +1,186 @@
+"""Overrides find their place, and wrong ones are refused."""
+
+from __future__ import annotations
+
+import pytest
+from stable_baselines3 import DQN, PPO, SAC
+
+from sb3_sparse.errors import ConfigError
+from sb3_sparse.zoo.run import Run
+from sb3_sparse.zoo.settings import CALLBACK, apply_overrides, method_of, parse_overrides
+
+
+def base(**more):
+    return {
+        "policy": "sb3_sparse.SparsePolicy",
+        "learning_rate": 0.1,
+        "policy_kwargs": {"sparsity": 0.9, "net_arch": [4]},
+        "callback": [{CALLBACK: {"method": "rigl", "update_interval": 7}}],
+        **more,
+    }
+
+
+def test_each_name_finds_its_own_place():
+    settings = base()
+    overrides = {
+        "learning_rate": 0.2,
+        "n_envs": 3,
+        "weight_decay": 1e-4,
+        "net_arch": [8, 8],
+        "update_interval": 9,
+        "drop_fraction": 0.1,
+    }
+    apply_overrides(settings, overrides, SAC)
+    assert settings == {
+        "policy": "sb3_sparse.SparsePolicy",
+        "learning_rate": 0.2,
+        "n_envs": 3,
+        "policy_kwargs": {"sparsity": 0.9, "net_arch": [8, 8], "weight_decay": 1e-4},
+        "callback": [{CALLBACK: {"method": "rigl", "update_interval": 9, "drop_fraction": 0.1}}],
+    }
+
+
+def test_policy_kwargs_are_merged_so_that_the_sparsity_is_not_lost():
+    settings = base()
+    apply_overrides(settings, {"policy_kwargs": {"net_arch": [2]}}, DQN)
+    assert settings["policy_kwargs"] == {"sparsity": 0.9, "net_arch": [2]}
+
+
+def test_arguments_of_every_base_class_count():
+    settings = base()
+    overrides = {"ortho_init": False, "clip_range": 0.1, "seed": 3, "n_critics": 3}
+    apply_overrides(settings, {"n_critics": 3}, SAC)
+    assert settings["policy_kwargs"]["n_critics"] == 3
+    with pytest.raises(ConfigError, match="PPO has no hyperparameter 'n_critics'"):
+        apply_overrides(base(), overrides, PPO)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("learning_rat", r"did you mean 'learning_rate'\?"),
+        ("update_intervall", r"did you mean 'update_interval'\?"),
+        ("env", "has no hyperparameter 'env'"),
+        ("observation_space", "has no hyperparameter"),
+        ("xyzzy", r"Of the algorithm: .*tau.* Of the policy: .*sparsity.* schedule: .*update_on"),
+    ],
+)
+def test_unknown_names_are_refused(name, message):
+    settings = base()
+    with pytest.raises(ConfigError, match=message):
+        apply_overrides(settings, {name: 1}, SAC)
+    assert settings == base()
+
+
+def test_a_schedule_without_a_callback_is_refused():
+    with pytest.raises(ConfigError, match="update_interval means nothing here"):
+        Run(method="dense", hyperparams={"update_interval": 5})
+
+
+def test_texts_are_read_as_the_zoo_writes_them():
+    texts = [
+        "learning_rate:0.001",
+        "train_freq:(1, 'episode')",
+        "clip_range:lin_0.2",
+        "use_sde:True",
+        "policy_kwargs:dict(net_arch=dict(pi=[8], qf=[9]), n_critics=1)",
+        "env_wrapper:sb3_sparse.wrappers.PixelNoise",
+        "noise_type:'normal'",
+    ]
+    assert parse_overrides(texts) == {
+        "learning_rate": 0.001,
+        "train_freq": (1, "episode"),
+        "clip_range": "lin_0.2",
+        "use_sde": True,
+        "policy_kwargs": {"net_arch": {"pi": [8], "qf": [9]}, "n_critics": 1},
+        "env_wrapper": "sb3_sparse.wrappers.PixelNoise",
+        "noise_type": "normal",
+    }
+
+
+def test_texts_are_not_executed():
+    assert parse_overrides(["a:__import__('os')"]) == {"a": "__import__('os')"}
+
+
+@pytest.mark.parametrize("text", ["learning_rate", "learning_rate:", ":1", "=1"])
+def test_a_text_without_name_or_value_is_refused(text):
+    with pytest.raises(ConfigError, match="name:value"):
+        parse_overrides([text])
+
+
+def test_the_method_is_read_off_the_callback_or_the_sparsity():
+    assert method_of(base()) == "rigl"
+    assert method_of(base(callback=None)) == "static"
+    dense = base(policy_kwargs={"sparsity": 0.0})
+    dense.pop("callback")
+    assert method_of(dense) == "dense"
+    with pytest.raises(ConfigError, match="unknown method 'rig'"):
+        method_of(base(callback=[{CALLBACK: {"method": "rig"}}]))
+
+
+def test_what_the_user_wants_wins_over_the_config():
+    run = Run(
+        algo="sac",
+        env_id="Ant-v5",
+        method="set",
+        sparsity=0.5,
+        distribution="uniform",
+        n_timesteps=77,
+        n_envs=2,
+        hyperparams={"sparsity_aware_init": False},
+    )
+    settings = run.settings()
+    assert settings["n_timesteps"] == 77
+    assert settings["n_envs"] == 2
+    assert settings["policy_kwargs"]["sparsity"] == 0.5
+    assert settings["policy_kwargs"]["distribution"] == "uniform"
+    assert settings["policy_kwargs"]["sparsity_aware_init"] is False
+    assert settings["learning_starts"] == 10_000
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (dict(algo="reinforce"), "unknown algorithm 'reinforce'; allowed are"),
+        (dict(env_id="CartPol-v1"), r"did you mean 'CartPole-v1'\?"),
+        (dict(env_id="Zzzzzzz"), "give a Gymnasium id"),
+        (dict(method="gmp"), "no config is shipped for method 'gmp'"),
+        (dict(sparsity=1.0), r"sparsity must lie in \[0, 1\)"),
+        (dict(distribution="erdos"), "distribution"),
+        (dict(seed=-1), "seed must lie in"),
+        (dict(n_timesteps=0), "n_timesteps must be 1 or more"),
+        (dict(eval_freq=-5), "eval_freq must be 1 or more"),
+        (dict(method="dense", sparsity=0.9), "--match-params 0.9"),
+        (dict(method="rigl", match_params=0.9), "for --method dense, not 'rigl'"),
+        (dict(method="dense", match_params=1.5), "match_params"),
+    ],
+)
+def test_wrong_runs_are_refused(arguments, message):
+    with pytest.raises(ConfigError, match=message):
+        Run(**arguments)
+
+
+def test_a_file_of_ones_own_decides_the_method(tmp_path):
+    path = tmp_path / "mine.yml"
+    path.write_text(
+        "default:\n  policy: SparsePolicy\n  n_timesteps: !!float 1e3\n"
+        '  policy_kwargs: "dict(sparsity=0.5, net_arch=[8])"\n'
+    )
+    settings = Run(conf_file=str(path)).settings()
+    assert method_of(settings) == "static"
+    assert settings["policy_kwargs"] == {"sparsity": 0.5, "net_arch": [8]}
+    assert type(settings["n_timesteps"]) is int
+    with pytest.raises(ConfigError, match="trains with method 'static', not 'rigl'"):
+        Run(conf_file=str(path), method="rigl")
+
+
+def test_a_shipped_file_can_be_named():
+    run = Run(env_id="PongNoFrameskip-v4", conf_file="dqn_impala", method="prune")
+    assert run.config.name == "dqn_impala.yml"
+    assert run.config.parent.name == "prune"
+
+
+def test_a_run_survives_being_written_down():
+    run = Run(algo="ppo", env_id="Ant-v4", hyperparams={"gamma": 0.9}, eval_episodes=3)
+    assert Run(**run.as_dict()) == run
+    assert run.evaluation() == {"eval_freq": 2000, "eval_episodes": 3}
