@@ -5,8 +5,10 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
+import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 from stable_baselines3 import DQN, PPO
 
@@ -46,6 +48,24 @@ def test_train_says_what_it_does_and_enjoy_and_inspect_read_it(tmp_path):
     nnz, density = re.search(r"total\s+(\d+)\s+(0\.\d+)", done.stdout).groups()
     assert 72 <= int(nnz) <= 75
     assert float(density) == round(int(nnz) / 720, 4)
+
+
+def test_a_killed_run_goes_on_from_its_last_evaluation(tmp_path):
+    folder = tmp_path / "logs" / "dqn" / "CartPole-v1_1"
+    args = ["-n", "3000", "--eval-freq", "300", "--eval-episodes", "1", *QUICK]
+    code = "from sb3_sparse.cli import main; main()"
+    running = subprocess.Popen([sys.executable, "-c", code, "train", *args], cwd=tmp_path)
+    while not list(folder.glob("resume/[0-9]*")):
+        assert running.poll() is None, "it ended before its first checkpoint"
+        time.sleep(0.05)
+    running.kill()
+    running.wait()
+    assert not (folder / "CartPole-v1.zip").exists()
+    done = sb3_sparse("train", "--resume", str(folder), cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    with np.load(folder / "evaluations.npz") as evaluations:
+        assert evaluations["timesteps"].tolist() == list(range(300, 3001, 300))
+    assert DQN.load(folder / "CartPole-v1.zip").num_timesteps == 3000
 
 
 def test_options_and_a_second_run_beside_the_first(tmp_path):

@@ -13,6 +13,7 @@ BUDGETS = {
     "sac_rigl_mujoco.py": ["--steps", "1200"],
     "ppo_pruning.py": ["--steps", "3000"],
     "dqn_set.py": ["--steps", "2000"],
+    "run_from_config.py": ["--steps", "2000"],
     "sparsify_checkpoint.py": ["--steps", "2000"],
 }
 
