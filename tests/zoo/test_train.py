@@ -305,3 +305,27 @@ def test_every_method_and_algorithm_runs_by_its_config(method, algo, tmp_path):
     kwargs = run.settings()["policy_kwargs"]
     assert policy.sparsity_config.sparsity == kwargs["sparsity"]
     assert policy.sparse.weight_decay == kwargs["weight_decay"]
+
+
+def test_an_atari_run_stacks_frames_resumes_and_is_filmed(tmp_path, monkeypatch):
+    monkeypatch.setattr("sb3_sparse.zoo.results.FINAL_EPISODES", 1)
+    small = {"channels": [2, 2, 2], "features_dim": 8}
+    run = Run(
+        env_id="PongNoFrameskip-v4",
+        conf_file="dqn_impala",
+        n_timesteps=60,
+        eval_freq=30,
+        eval_episodes=1,
+        hyperparams={"features_extractor_kwargs": small, "learning_starts": 8, "buffer_size": 100},
+    )
+    stopped = train(run, tmp_path, [Stop(40)])
+    assert stopped.folder == tmp_path / "dqn" / "PongNoFrameskip-v4_1"
+    outcome = resume(stopped.folder)
+    assert outcome.model.observation_space.shape == (4, 84, 84)
+    assert evaluations(outcome.folder)[0] == [30, 60]
+    assert read_record(outcome.folder)["layers"][0]["shape"] == [2, 4, 3, 3]
+    score = enjoy(outcome.folder, episodes=1, video=True)
+    assert -21 <= score.mean_return <= 21
+    (video,) = score.videos
+    assert video.suffix == ".mp4"
+    assert video.stat().st_size > 1000
