@@ -206,4 +206,8 @@ def main() -> None:
         Console(stderr=True, highlight=False).print(f"Error: {error}", markup=False, soft_wrap=True)
         sys.exit(2)
     except KeyboardInterrupt:
+        print(
+            "Interrupted; a run that had begun goes on with sb3-sparse train --resume <its folder>",
+            file=sys.stderr,
+        )
         sys.exit(INTERRUPTED)

@@ -34,6 +34,7 @@ class Experiment(ExperimentManager):
     :param run: what to train
     :param settings: the config's entry, as it shall be trained
     :param folder: the run's own folder
+    :param evaluation: ``eval_freq`` and ``eval_episodes``
     :param start: folder with the model to go on with (a checkpoint, or ``folder``); None: train
         anew
     :param tensorboard_log: where TensorBoard's files go; empty: none
@@ -44,11 +45,12 @@ class Experiment(ExperimentManager):
         run: Run,
         settings: Mapping[str, Any],
         folder: Path,
+        evaluation: Mapping[str, int],
         start: Path | None = None,
         tensorboard_log: str = "",
     ) -> None:
         self.settings = settings
-        evaluation = run.evaluation()
+        self.evaluation = evaluation
         steps = int(start.name) if start is not None and start != folder else 0
         arguments = {
             **run.as_dict(),
@@ -117,10 +119,10 @@ def quiet() -> Iterator[None]:
 
 
 def spaces_of(
-    run: Run, settings: Mapping[str, Any], folder: Path
+    run: Run, settings: Mapping[str, Any], folder: Path, evaluation: Mapping[str, int]
 ) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
     """Observation and action space that the policy sees, wrappers and stacking included."""
-    experiment = Experiment(run, settings, folder)
+    experiment = Experiment(run, settings, folder, evaluation)
     with quiet():
         hyperparams, _ = experiment.read_hyperparameters()
         _, experiment.env_wrapper, _, experiment.vec_env_wrapper = (

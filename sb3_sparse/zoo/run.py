@@ -76,7 +76,6 @@ class Run:
             raise ConfigError(f"the seed must lie in [0, 2^31), got {self.seed}")
         if self.match_params is not None:
             check_sparsity(self.match_params, "match_params")
-        self.settings()
 
     @property
     def algorithm(self) -> type[BaseAlgorithm]:
@@ -93,7 +92,7 @@ class Run:
     def settings(self) -> dict[str, Any]:
         """The config's entry, with everything that this run wants otherwise.
 
-        :raises ConfigError: if the config has none, or if things contradict each other
+        :raises ConfigError: if the config has none, or if it and the run contradict each other
         """
         settings = entry_of(self.config, self.env_id, is_atari(self.env_id))
         settings["policy_kwargs"] = policy_kwargs_of(settings)

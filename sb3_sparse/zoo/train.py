@@ -48,9 +48,11 @@ def train(
     """
     if tensorboard_log and importlib.util.find_spec("tensorboard") is None:
         raise ConfigError("--tensorboard-log needs TensorBoard: pip install tensorboard")
-    settings = run.settings()
+    settings, evaluation = run.settings(), run.evaluation()
     with explained(run):
-        observation_space, action_space = spaces_of(run, settings, log_folder / run.algo / "new")
+        observation_space, action_space = spaces_of(
+            run, settings, log_folder / run.algo / "new", evaluation
+        )
     check_action_space(run, action_space)
     use_few_threads(observation_space)
     record: dict[str, Any] = {}
@@ -67,14 +69,14 @@ def train(
         method=method_of(settings),
         run=run.as_dict(),
         settings=settings,
-        evaluation=run.evaluation(),
+        evaluation=evaluation,
         tensorboard_log=tensorboard_log,
         versions=versions(),
         **record,
     )
     try:
         with explained(run):
-            experiment = Experiment(run, settings, folder, None, tensorboard_log)
+            experiment = Experiment(run, settings, folder, evaluation, None, tensorboard_log)
             model = experiment.setup()
     except Exception:
         shutil.rmtree(folder)  # nothing was trained
@@ -96,10 +98,11 @@ def resume(folder: Path, callbacks: Sequence[BaseCallback] = ()) -> Outcome:
         )
     run = Run(**record["run"])
     settings = record["settings"]
-    observation_space, _ = spaces_of(run, settings, folder)
+    evaluation = record["evaluation"]
+    observation_space, _ = spaces_of(run, settings, folder, evaluation)
     use_few_threads(observation_space)
     start = folder if record["status"] == "evaluating" else last_checkpoint(folder)
-    experiment = Experiment(run, settings, folder, start, record["tensorboard_log"])
+    experiment = Experiment(run, settings, folder, evaluation, start, record["tensorboard_log"])
     return _learn(run, experiment, experiment.setup(), folder, start, callbacks)
 
 
@@ -113,7 +116,7 @@ def _learn(
 ) -> Outcome:
     policy = model.policy
     assert isinstance(policy, SparsePolicyMixin)
-    schedule = run.evaluation()
+    schedule = experiment.evaluation
     envs = experiment.evaluation_envs(
         min(EVALUATION_ENVS, schedule["eval_episodes"]), run.seed + 20_000
     )
@@ -128,9 +131,9 @@ def _learn(
     checkpoints = Checkpoints(folder, experiment.env_name, evaluation)
     if start is not None and start != folder:
         checkpoints.restore(start)
-    done = model.num_timesteps
-    write_record(folder, status="running", num_timesteps=done, **sparsity_of(policy))
-    planned = experiment.n_timesteps
+    done, planned = model.num_timesteps, experiment.n_timesteps
+    status = "running" if done < planned else "evaluating"
+    write_record(folder, status=status, num_timesteps=done, **sparsity_of(policy))
     try:
         if done < planned:
             with checkpoints.on_signals():

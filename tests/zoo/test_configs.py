@@ -192,11 +192,11 @@ def test_an_environment_without_settings_says_which_file_which_keys_and_what_to_
     path = tmp_path / "mine.yml"
     path.write_text("Pendulum-v1: {n_timesteps: 5}\n")
     with pytest.raises(ConfigError, match=r"mine\.yml has no settings for 'CartPole-v1'") as caught:
-        Run(conf_file=str(path))
+        Run(conf_file=str(path)).settings()
     assert "its keys are Pendulum-v1" in str(caught.value)
     assert "`default` for every environment" in str(caught.value)
     with pytest.raises(ConfigError, match="`atari` for every Atari game"):
-        Run(conf_file=str(path), env_id="PongNoFrameskip-v4")
+        Run(conf_file=str(path), env_id="PongNoFrameskip-v4").settings()
 
 
 @pytest.mark.parametrize(
@@ -214,7 +214,7 @@ def test_a_file_that_is_wrong_says_how(content, message, tmp_path):
     path = tmp_path / "mine.yml"
     path.write_text(content)
     with pytest.raises(ConfigError, match=message):
-        Run(conf_file=str(path))
+        Run(conf_file=str(path)).settings()
 
 
 def test_what_is_not_shipped_names_what_is(tmp_path):
@@ -223,7 +223,7 @@ def test_what_is_not_shipped_names_what_is(tmp_path):
     with pytest.raises(ConfigError, match="only for dense, prune, static, set, rigl"):
         config_path("gmp", "sac")
     with pytest.raises(ConfigError, match="no config file"):
-        Run(conf_file=str(tmp_path / "none.yml"))
+        Run(conf_file=str(tmp_path / "none.yml")).settings()
 
 
 def test_entries_are_copies():

@@ -74,7 +74,7 @@ def test_unknown_names_are_refused(name, message):
 
 def test_a_schedule_without_a_callback_is_refused():
     with pytest.raises(ConfigError, match="update_interval means nothing here"):
-        Run(method="dense", hyperparams={"update_interval": 5})
+        Run(method="dense", hyperparams={"update_interval": 5}).settings()
 
 
 def test_texts_are_read_as_the_zoo_writes_them():
@@ -157,7 +157,7 @@ def test_what_the_user_wants_wins_over_the_config():
 )
 def test_wrong_runs_are_refused(arguments, message):
     with pytest.raises(ConfigError, match=message):
-        Run(**arguments)
+        Run(**arguments).settings()
 
 
 def test_a_file_of_ones_own_decides_the_method(tmp_path):
@@ -171,7 +171,7 @@ def test_a_file_of_ones_own_decides_the_method(tmp_path):
     assert settings["policy_kwargs"] == {"sparsity": 0.5, "net_arch": [8]}
     assert type(settings["n_timesteps"]) is int
     with pytest.raises(ConfigError, match="trains with method 'static', not 'rigl'"):
-        Run(conf_file=str(path), method="rigl")
+        Run(conf_file=str(path), method="rigl").settings()
 
 
 def test_a_shipped_file_can_be_named():

@@ -220,6 +220,17 @@ def test_a_checkpoint_half_written_is_not_one(tmp_path):
     assert resume(folder).finished
 
 
+def test_a_resume_needs_nothing_but_the_run(tmp_path, monkeypatch):
+    path = tmp_path / "mine.yml"
+    path.write_text(DQN_RUN.config.read_text())
+    run = replace(DQN_RUN, conf_file=str(path))
+    stopped = train(run, tmp_path, [Stop(300)])
+    path.unlink()
+    monkeypatch.setattr("sb3_sparse.zoo.run.evaluation_of", None)
+    assert resume(stopped.folder).finished
+    assert evaluations(stopped.folder)[0] == [200, 400, 600, 800, 1000]
+
+
 def test_masks_move_after_a_resume_as_the_schedule_says(tmp_path):
     run = replace(DQN_RUN, hyperparams={**DQN_RUN.hyperparams, "net_arch": [64, 64]})
     stopped = train(run, tmp_path, [Stop(500)])
