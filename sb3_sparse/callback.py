@@ -138,8 +138,9 @@ class SparsityCallback(BaseCallback):
             warnings.warn(
                 f"{self.plan.method!r} had no mask update, so this was static training: the "
                 f"networks have made {', '.join(str(n.clock) for n in sparse.networks)} gradient "
-                f"steps, and update_interval is {self.plan.update_interval}; train longer or "
-                "choose a smaller one",
+                f"steps, and update_interval is {self.plan.update_interval}, with updates from "
+                f"{self.plan.begin:.0%} to {self.plan.end:.0%} of training; train longer or choose "
+                "a smaller one",
                 stacklevel=2,
             )
 

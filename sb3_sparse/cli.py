@@ -131,8 +131,11 @@ def train(
     console.print(f"Sparsity {reached:.2%}. Return over {results[0].episodes} episodes:")
     for result in results:
         _print_score(f"{result.what}:", result.mean_return, result.std_return, result.path)
-    console.print("The best policy was chosen by other episodes. Look at it:")
-    for command in (f"enjoy {outcome.folder} --best", f"inspect {results[-1].path}"):
+    best = " --best" if len(results) > 1 else ""
+    console.print(
+        "The best policy was chosen by other episodes. Look at it:" if best else "Look at it:"
+    )
+    for command in (f"enjoy {outcome.folder}{best}", f"inspect {results[-1].path}"):
         console.print(f"sb3-sparse {command}", soft_wrap=True)
 
 

@@ -42,8 +42,8 @@ def stack(inputs: int, outputs: int) -> list[nn.Module]:
 class ImpalaCNN(BaseFeaturesExtractor):
     """The paper's ResNet: three stacks and one dense layer, no batch norm.
 
-    ``policy_kwargs=dict(features_extractor_class=ImpalaCNN, net_arch=[])`` puts it under DQN's Q
-    head; PPO's ``net_arch`` is ``[]`` by default for images.
+    ``policy_kwargs=dict(features_extractor_class=ImpalaCNN, net_arch=[])`` puts it under the heads
+    of DQN or PPO; without ``net_arch=[]`` SB3 puts hidden layers between.
 
     :param observation_space: images, channels first, of shape (channels, height, width)
     :param channels: channels of the three stacks

@@ -10,6 +10,18 @@ from sb3_sparse.errors import ConfigError
 ARGUMENTS = ("features_extractor_class", "optimizer_class", "activation_fn")
 
 
+def import_path(path: str) -> Any:
+    """What a dotted path names.
+
+    :raises ImportError: if there is no such thing
+    """
+    module, _, name = path.rpartition(".")
+    try:
+        return getattr(import_module(module), name)
+    except (AttributeError, ValueError) as error:
+        raise ImportError(str(error)) from error
+
+
 def import_named(kwargs: dict[str, Any]) -> None:
     """Replace, in place, the path of a class (``"torch.nn.Tanh"``) by the class itself.
 
@@ -20,10 +32,9 @@ def import_named(kwargs: dict[str, Any]) -> None:
         path = kwargs.get(argument)
         if not isinstance(path, str):
             continue
-        module, _, name = path.rpartition(".")
         try:
-            kwargs[argument] = getattr(import_module(module), name)
-        except (ImportError, AttributeError, ValueError) as error:
+            kwargs[argument] = import_path(path)
+        except ImportError as error:
             raise ConfigError(
                 f"{argument}={path!r} cannot be imported ({error}); give a class or its dotted "
                 "path, e.g. 'torch.nn.ReLU'"

@@ -29,11 +29,8 @@ class Noise(gym.ObservationWrapper[Any, Any, Any], gym.utils.RecordConstructorAr
     def __init__(self, env: gym.Env[Any, Any], sigma: float, **arguments: Any) -> None:
         gym.utils.RecordConstructorArgs.__init__(self, sigma=sigma, **arguments)
         super().__init__(env)
-        if (
-            isinstance(sigma, bool)
-            or not isinstance(sigma, (int, float))
-            or not 0 <= sigma < np.inf
-        ):
+        number = isinstance(sigma, (int, float, np.number)) and not isinstance(sigma, bool)
+        if not number or not 0 <= sigma < np.inf:
             raise ConfigError(f"sigma must be a number, 0 or more, got {sigma!r}")
         self.sigma = float(sigma)
         self.generator = np.random.default_rng()

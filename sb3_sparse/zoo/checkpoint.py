@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import signal
 import sys
@@ -12,15 +11,21 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 
+from filelock import FileLock, Timeout
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_sparse.zoo.evaluation import NPZ, Evaluation
+from sb3_sparse.errors import ConfigError
+from sb3_sparse.zoo.evaluation import Evaluation
 from sb3_sparse.zoo.record import write_record
 
 FOLDER = "resume"
-STATE = "state.json"
 REPLAY_BUFFER = "replay_buffer.pkl"
+MONITOR = ".monitor.csv"
+
+
+class StopTraining(Exception):
+    """Raised through ``learn`` at the start of a rollout, so that no further step is taken."""
 
 
 class Checkpoints(BaseCallback):
@@ -41,7 +46,6 @@ class Checkpoints(BaseCallback):
         self.env_name = env_name
         self.evaluation = evaluation
         self.stop_wanted = False
-        self.stopped = False
 
     def _on_training_start(self) -> None:
         self.saved_evaluations = self.evaluation.count
@@ -51,10 +55,11 @@ class Checkpoints(BaseCallback):
         if evaluated or self.stop_wanted:
             self.save()
             self.saved_evaluations = self.evaluation.count
-            self.stopped = self.stop_wanted
+        if self.stop_wanted:
+            raise StopTraining
 
     def _on_step(self) -> bool:
-        return not self.stopped
+        return True
 
     def save(self) -> None:
         """Save the model as it is now."""
@@ -70,18 +75,14 @@ class Checkpoints(BaseCallback):
         normalization = self.model.get_vec_normalize_env()
         if normalization is not None:
             normalization.save(str(new / self.env_name / "vecnormalize.pkl"))
-        if self.evaluation.count:
-            shutil.copy(self.evaluation.folder / NPZ, new / NPZ)
-        (new / STATE).write_text(json.dumps(self.evaluation.state()))
+        self.evaluation.save(new)
+        for path in self.parent_folder.parent.glob(f"*{MONITOR}"):
+            shutil.copy(path, new / path.name)
         new.rename(final)
         write_record(self.parent_folder.parent, num_timesteps=self.model.num_timesteps)
         for other in self.parent_folder.iterdir():
             if other != final:
                 shutil.rmtree(other)
-
-    def restore(self, checkpoint: Path) -> None:
-        """Take back the evaluations of a checkpoint, whose model the engine has loaded."""
-        self.evaluation.restore(json.loads((checkpoint / STATE).read_text()), checkpoint / NPZ)
 
     @contextmanager
     def on_signals(self) -> Iterator[None]:
@@ -95,8 +96,8 @@ class Checkpoints(BaseCallback):
                 raise KeyboardInterrupt
             self.stop_wanted = True
             print(
-                "\nStopping at the end of this rollout; Ctrl-C again stops at once and falls back "
-                "to the last evaluation",
+                "\nStopping as soon as this rollout has been learnt from; Ctrl-C again stops at "
+                "once and falls back to the last evaluation",
                 file=sys.stderr,
             )
 
@@ -112,6 +113,41 @@ def last_checkpoint(folder: Path) -> Path | None:
     """The newest complete checkpoint of a run; None if it has none."""
     found = [path for path in (folder / FOLDER).glob("*") if path.name.isdigit()]
     return max(found, key=lambda path: int(path.name), default=None)
+
+
+def restore_monitors(folder: Path, checkpoint: Path | None) -> None:
+    """Set aside the training episodes that a checkpoint knows of, and forget all later ones.
+
+    What was ``0.monitor.csv`` becomes ``0.1.monitor.csv``, and so on: a file for each time that the
+    run was started, since SB3 reads times relative to a file's own start.
+    """
+    for path in folder.glob(f"*{MONITOR}"):
+        path.unlink()
+    if checkpoint is None:
+        return
+    for path in checkpoint.glob(f"*{MONITOR}"):
+        rank, *part = path.name.removesuffix(MONITOR).split(".")
+        if not part:
+            part = [str(1 + len(list(checkpoint.glob(f"{rank}.*{MONITOR}"))))]
+        shutil.copy(path, folder / f"{rank}.{part[0]}{MONITOR}")
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Within it, no other process trains the run.
+
+    :raises ConfigError: if one does already
+    """
+    lock = FileLock(folder / ".lock")
+    try:
+        lock.acquire(timeout=0)
+    except Timeout as error:
+        raise ConfigError(f"another process is training the run in {folder}") from error
+    try:
+        yield
+    finally:
+        lock.release()
+        (folder / ".lock").unlink(missing_ok=True)
 
 
 def clear_checkpoints(folder: Path) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib.util
+import os
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -58,12 +60,16 @@ def enjoy(
     path = folder / ("best_model.zip" if best else f"{env_name}.zip")
     if not path.is_file():
         models = ", ".join(sorted(file.name for file in folder.glob("*.zip"))) or "none"
-        raise ConfigError(
-            f"{folder} has no {path.name}; its models: {models}. A run that was killed has its "
-            "last policy only after sb3-sparse train --resume, its best one with --best"
+        why = (
+            "there is a best policy after the first evaluation at the sparsity asked for"
+            if best
+            else "a run that was killed has its last policy after sb3-sparse train --resume"
         )
+        raise ConfigError(f"{folder} has no {path.name} (its models: {models}): {why}")
     if video and importlib.util.find_spec("moviepy") is None:
         raise MissingExtra("recording a video", "video")
+    if video and sys.platform == "linux" and not os.environ.get("DISPLAY"):
+        os.environ.setdefault("MUJOCO_GL", "egl")  # MuJoCo's way to render without a display
     set_random_seed(seed)
     env_kwargs: dict[str, Any] = dict(arguments.get("env_kwargs") or {})
     if video:

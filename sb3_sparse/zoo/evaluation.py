@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
@@ -12,6 +13,8 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_sparse.policies.mixin import SparsePolicyMixin
 
 NPZ = "evaluations.npz"
+BEST = "best_model.zip"
+STATE = "evaluation.json"
 
 
 class Evaluation(EvalCallback):
@@ -55,16 +58,30 @@ class Evaluation(EvalCallback):
         """Evaluations done."""
         return len(self.evaluations_timesteps)
 
-    def state(self) -> dict[str, Any]:
-        """What :meth:`restore` needs besides ``evaluations.npz``."""
-        return {"best_mean_reward": self.best_mean_reward, "count": self.count}
+    def save(self, folder: Path) -> None:
+        """Save the evaluations so far, and the best model by them."""
+        state = {"best_mean_reward": self.best_mean_reward, "count": self.count}
+        (folder / STATE).write_text(json.dumps(state))
+        for name in (NPZ, BEST):
+            if (self.folder / name).is_file():
+                shutil.copy(self.folder / name, folder / name)
 
-    def restore(self, state: dict[str, Any], npz: Path) -> None:
-        """Take back the evaluations of an interrupted run."""
+    def forget(self) -> None:
+        """Remove what a run that is started anew has evaluated before."""
+        for name in (NPZ, BEST):
+            (self.folder / name).unlink(missing_ok=True)
+
+    def restore(self, folder: Path) -> None:
+        """Take back what :meth:`save` saved; what was evaluated after that is forgotten."""
+        self.forget()
+        state = json.loads((folder / STATE).read_text())
         self.best_mean_reward = state["best_mean_reward"]
+        for name in (NPZ, BEST):
+            if (folder / name).is_file():
+                shutil.copy(folder / name, self.folder / name)
         if state["count"] == 0:
             return
-        with np.load(npz) as saved:
+        with np.load(folder / NPZ) as saved:
             self.evaluations_timesteps = saved["timesteps"].tolist()
             self.evaluations_results = saved["results"].tolist()
             self.evaluations_length = saved["ep_lengths"].tolist()

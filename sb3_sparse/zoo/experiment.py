@@ -79,11 +79,16 @@ class Experiment(ExperimentManager):
         if start is not None:
             self.trained_agent = str(start / f"{self.env_name}.zip")
             self.continue_training = True
-            self.monitor_kwargs = {"override_existing": False}
+        self.trained = start == folder  # so that nothing is to be written any more
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], OrderedDict[str, Any]]:
         """The settings, in place of the YAML file that they came from."""
         return deepcopy(dict(self.settings)), OrderedDict(sorted(deepcopy(self.settings).items()))
+
+    def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
+        """As rl-zoo makes them, but the episodes of a run that is trained stay on record."""
+        envs: VecEnv = super().create_envs(n_envs, eval_env, no_log or self.trained)
+        return envs
 
     def setup(self) -> BaseAlgorithm:
         """The model, new or as the checkpoint has it."""

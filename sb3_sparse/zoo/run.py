@@ -14,7 +14,12 @@ from sb3_sparse.policies.aliases import supported_algorithms
 from sb3_sparse.sparsity.distributions import check_distribution, check_sparsity
 from sb3_sparse.zoo.configs import config_path, entry_of, evaluation_of
 from sb3_sparse.zoo.environments import is_atari, known_environment
-from sb3_sparse.zoo.settings import apply_overrides, method_of, policy_kwargs_of
+from sb3_sparse.zoo.settings import (
+    apply_overrides,
+    check_values,
+    method_of,
+    policy_kwargs_of,
+)
 
 DENSE = "dense"
 
@@ -97,6 +102,7 @@ class Run:
         settings = entry_of(self.config, self.env_id, is_atari(self.env_id))
         settings["policy_kwargs"] = policy_kwargs_of(settings)
         method = method_of(settings)
+        check_values(settings)
         if self.method not in (None, method):
             raise ConfigError(
                 f"{self.config} trains with method {method!r}, not {self.method!r}; leave --method "
@@ -118,12 +124,21 @@ class Run:
             if getattr(self, name) is not None
         }
         apply_overrides(settings, {**self.hyperparams, **wanted}, self.algorithm)
+        check_values(settings)
+        if method_of(settings) != method:
+            raise ConfigError(
+                f"what is changed makes this {method_of(settings)!r} training, not {method!r}; "
+                f"choose it with --method {method_of(settings)}"
+            )
         if "n_timesteps" not in settings:
             raise ConfigError(
                 f"the settings of {self.env_id} in {self.config} lack n_timesteps; add it there or "
                 "give -n"
             )
-        settings["n_timesteps"] = int(settings["n_timesteps"])
+        steps = settings["n_timesteps"]
+        if isinstance(steps, bool) or not isinstance(steps, (int, float)) or steps < 1:
+            raise ConfigError(f"n_timesteps must be a number, 1 or more, got {steps!r}")
+        settings["n_timesteps"] = int(steps)
         return settings
 
     def evaluation(self) -> dict[str, int]:

@@ -13,6 +13,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from sb3_sparse.callback import SparsityCallback
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.policies.aliases import SparsePolicy
+from sb3_sparse.policies.config import SPARSITY_MISSING
+from sb3_sparse.policies.named import import_path
 from sb3_sparse.topology import method_named
 
 POLICY = f"sb3_sparse.{SparsePolicy}"
@@ -23,6 +25,10 @@ ZOO_KEYS = frozenset(
     + ("n_timesteps", "noise_std", "noise_type", "normalize", "policy", "policy_kwargs")
     + ("vec_env_wrapper",)
 )
+
+# Arguments of every algorithm that a run sets itself, by options of their own.
+SET_BY_THE_ENGINE = frozenset({"device", "seed", "tensorboard_log", "verbose"})
+SCHEDULES = ("learning_rate", "clip_range", "clip_range_vf")
 
 
 def parse_overrides(texts: Iterable[str]) -> dict[str, Any]:
@@ -72,9 +78,9 @@ def apply_overrides(
 
     :raises ConfigError: for a name that none of them has
     """
-    of_callback = _arguments(SparsityCallback) - {"verbose"}
+    of_callback = _arguments(SparsityCallback) - {"method", "verbose"}
     of_policy = _arguments(algorithm.policy_aliases[SparsePolicy]) - {"kwargs"}
-    of_algorithm = _arguments(algorithm) | ZOO_KEYS
+    of_algorithm = (_arguments(algorithm) - SET_BY_THE_ENGINE) | ZOO_KEYS
     for name, value in overrides.items():
         if name in of_algorithm:
             known = settings.get(name)
@@ -117,11 +123,64 @@ def sparsity_callback(settings: Mapping[str, Any], wanted: str = "") -> dict[str
     :param wanted: what is to be set, for the message
     :raises ConfigError: if there is no such callback
     """
-    for callback in _callbacks(settings):
-        if isinstance(callback, dict) and CALLBACK in callback:
-            arguments: dict[str, Any] = callback[CALLBACK]
-            return arguments
-    raise ConfigError(f"{wanted} means nothing here: these settings train without {CALLBACK}")
+    arguments = _find_callback(settings)
+    if arguments is None:
+        raise ConfigError(f"{wanted} means nothing here: these settings train without {CALLBACK}")
+    return arguments
+
+
+def _find_callback(settings: Mapping[str, Any]) -> dict[str, Any] | None:
+    callbacks = settings.get("callback") or []
+    for callback in callbacks if isinstance(callbacks, list) else [callbacks]:
+        if isinstance(callback, dict):
+            ((path, arguments),) = callback.items()
+        else:
+            path, arguments = callback, {}
+        if _is_ours(path):
+            if "method" not in arguments:
+                raise ConfigError(f"{path} needs a method, e.g. {path}: {{method: rigl}}")
+            found: dict[str, Any] = arguments
+            return found
+    return None
+
+
+def _is_ours(path: Any) -> bool:
+    try:
+        return import_path(path) is SparsityCallback
+    except ImportError:
+        return False  # rl-zoo says so when it imports it
+
+
+def check_values(settings: Mapping[str, Any]) -> None:
+    """Refuse what YAML has read as text but was meant as a number.
+
+    :raises ConfigError: if there is any
+    """
+    callback = _find_callback(settings) or {}
+    for part in (settings, policy_kwargs_of(settings), callback):
+        for name, value in part.items():
+            if isinstance(value, str) and _is_number(value):
+                raise ConfigError(
+                    f"{name} is the text {value!r}, as YAML reads a number without a dot and a "
+                    f"sign; write {name}: !!float {value}"
+                )
+    for name in SCHEDULES:
+        value = settings.get(name)
+        if isinstance(value, str) and not _is_number(value.removeprefix("lin_")):
+            raise ConfigError(
+                f"{name} must be a number, or lin_ and a number for a linear decay to 0, e.g. "
+                f"lin_0.001, got {value!r}"
+            )
+    if "sparsity" not in policy_kwargs_of(settings):
+        raise ConfigError(SPARSITY_MISSING)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def method_of(settings: Mapping[str, Any]) -> str:
@@ -134,9 +193,9 @@ def method_of(settings: Mapping[str, Any]) -> str:
         raise ConfigError(
             f"the policy must be {POLICY} (with sparsity 0.0 for dense training), got {policy!r}"
         )
-    if any(isinstance(c, dict) and CALLBACK in c for c in _callbacks(settings)):
-        method = sparsity_callback(settings)["method"]
-        return method_named(method).name
+    callback = _find_callback(settings)
+    if callback is not None:
+        return method_named(callback["method"]).name
     sparsity = policy_kwargs_of(settings).get("sparsity")
     return "dense" if sparsity == 0.0 else "static"
 
@@ -155,8 +214,3 @@ def policy_kwargs_of(settings: Mapping[str, Any]) -> dict[str, Any]:
             "{sparsity: 0.9, net_arch: [256, 256], activation_fn: torch.nn.ReLU}"
         )
     return kwargs
-
-
-def _callbacks(settings: Mapping[str, Any]) -> list[Any]:
-    callbacks = settings.get("callback") or []
-    return callbacks if isinstance(callbacks, list) else [callbacks]

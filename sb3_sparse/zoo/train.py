@@ -20,7 +20,14 @@ from stable_baselines3.common.preprocessing import is_image_space
 
 from sb3_sparse.errors import ConfigError, MissingExtra, SparsityError
 from sb3_sparse.policies.mixin import SparsePolicyMixin
-from sb3_sparse.zoo.checkpoint import Checkpoints, clear_checkpoints, last_checkpoint
+from sb3_sparse.zoo.checkpoint import (
+    Checkpoints,
+    StopTraining,
+    clear_checkpoints,
+    last_checkpoint,
+    locked,
+    restore_monitors,
+)
 from sb3_sparse.zoo.evaluation import Evaluation
 from sb3_sparse.zoo.experiment import Experiment, spaces_of
 from sb3_sparse.zoo.match import match_parameters
@@ -48,6 +55,10 @@ def train(
     """
     if tensorboard_log and importlib.util.find_spec("tensorboard") is None:
         raise ConfigError("--tensorboard-log needs TensorBoard: pip install tensorboard")
+    if tensorboard_log:
+        tensorboard_log = str(Path(tensorboard_log).absolute())  # also after a resume elsewhere
+    if run.device.startswith("cuda") and not th.cuda.is_available():
+        raise ConfigError(f"there is no device {run.device!r} here; give --device auto or cpu")
     settings, evaluation = run.settings(), run.evaluation()
     with explained(run):
         observation_space, action_space = spaces_of(
@@ -63,47 +74,63 @@ def train(
         settings["policy_kwargs"] = match.policy_kwargs
         record["match"] = asdict(match)
     folder = new_run_folder(log_folder / run.algo, run.env_id.replace("/", "-"))
-    write_record(
-        folder,
-        status="running",
-        method=method_of(settings),
-        run=run.as_dict(),
-        settings=settings,
-        evaluation=evaluation,
-        tensorboard_log=tensorboard_log,
-        versions=versions(),
-        **record,
-    )
-    try:
-        with explained(run):
-            experiment = Experiment(run, settings, folder, evaluation, None, tensorboard_log)
-            model = experiment.setup()
-    except Exception:
-        shutil.rmtree(folder)  # nothing was trained
-        raise
-    return _learn(run, experiment, model, folder, None, callbacks)
+    with locked(folder):
+        write_record(
+            folder,
+            status="running",
+            method=method_of(settings),
+            run=run.as_dict(),
+            settings=settings,
+            evaluation=evaluation,
+            tensorboard_log=tensorboard_log,
+            versions=versions(),
+            **record,
+        )
+        model = None
+        try:
+            with explained(run):
+                experiment = Experiment(run, settings, folder, evaluation, None, tensorboard_log)
+                model = experiment.setup()
+            return _learn(run, experiment, model, folder, None, callbacks)
+        except Exception as error:
+            if model is None or model.num_timesteps == 0:
+                shutil.rmtree(folder)  # nothing was trained
+            else:
+                _record_failure(folder, error)
+            raise
 
 
 def resume(folder: Path, callbacks: Sequence[BaseCallback] = ()) -> Outcome:
     """Go on with an interrupted run from its last checkpoint, or from the start if it has none.
 
     :param folder: the run's folder
-    :raises ConfigError: if there is no run, or it is finished
+    :raises ConfigError: if there is no run, if it is finished, or if another process trains it
     """
-    record = read_record(folder)
-    if record["status"] == "finished":
-        raise ConfigError(
-            f"the run in {folder} is finished; look at it with sb3-sparse enjoy {folder}, or train "
-            "longer anew with -n"
-        )
-    run = Run(**record["run"])
-    settings = record["settings"]
-    evaluation = record["evaluation"]
-    observation_space, _ = spaces_of(run, settings, folder, evaluation)
-    use_few_threads(observation_space)
-    start = folder if record["status"] == "evaluating" else last_checkpoint(folder)
-    experiment = Experiment(run, settings, folder, evaluation, start, record["tensorboard_log"])
-    return _learn(run, experiment, experiment.setup(), folder, start, callbacks)
+    read_record(folder)
+    with locked(folder):
+        record = read_record(folder)
+        if record["status"] == "finished":
+            raise ConfigError(
+                f"the run in {folder} is finished; look at it with sb3-sparse enjoy {folder}, or "
+                "train longer anew with -n"
+            )
+        run = Run(**record["run"])
+        settings, evaluation = record["settings"], record["evaluation"]
+        observation_space, _ = spaces_of(run, settings, folder, evaluation)
+        use_few_threads(observation_space)
+        start = folder if record["status"] == "evaluating" else last_checkpoint(folder)
+        if start != folder:
+            restore_monitors(folder, start)
+        experiment = Experiment(run, settings, folder, evaluation, start, record["tensorboard_log"])
+        try:
+            return _learn(run, experiment, experiment.setup(), folder, start, callbacks)
+        except Exception as error:
+            _record_failure(folder, error)
+            raise
+
+
+def _record_failure(folder: Path, error: Exception) -> None:
+    write_record(folder, status="failed", error=f"{type(error).__name__}: {error}")
 
 
 def _learn(
@@ -129,27 +156,32 @@ def _learn(
         experiment.keep_normalization(),
     )
     checkpoints = Checkpoints(folder, experiment.env_name, evaluation)
-    if start is not None and start != folder:
-        checkpoints.restore(start)
+    if start is None:
+        evaluation.forget()
+    elif start != folder:
+        evaluation.restore(start)
     done, planned = model.num_timesteps, experiment.n_timesteps
     status = "running" if done < planned else "evaluating"
-    write_record(folder, status=status, num_timesteps=done, **sparsity_of(policy))
+    state = {"device": str(model.device), "error": None}
+    write_record(folder, status=status, num_timesteps=done, **state, **sparsity_of(policy))
     try:
         if done < planned:
-            with checkpoints.on_signals():
-                model.learn(
-                    planned - done,
-                    callback=[*experiment.callbacks, evaluation, checkpoints, *callbacks],
-                    reset_num_timesteps=start is None,
-                    tb_log_name=f"{run.algo}_{folder.name}",
-                )
-        stopped = checkpoints.stopped
+            status = "evaluating"
+            try:
+                with checkpoints.on_signals():
+                    model.learn(
+                        planned - done,
+                        callback=[*experiment.callbacks, evaluation, checkpoints, *callbacks],
+                        reset_num_timesteps=start is None,
+                        tb_log_name=f"{run.algo}_{folder.name}",
+                    )
+            except StopTraining:
+                status = "interrupted"
         path = experiment.save(model)
-        status = "interrupted" if stopped else "evaluating"
         write_record(
             folder, status=status, num_timesteps=model.num_timesteps, **sparsity_of(policy)
         )
-        if stopped:
+        if checkpoints.stop_wanted:
             return Outcome(folder, model, ())
         results = final_results(run, model, path, envs, experiment.deterministic_eval)
     finally:

@@ -72,6 +72,10 @@ def test_pixels_stay_pixels(value, sigma, seed):
     assert frame.shape == (4, 4, 1)
 
 
+def test_sigma_may_be_numpys():
+    assert PixelNoise(Constant(7), np.float32(0.5)).sigma == 0.5
+
+
 def test_no_sigma_no_noise():
     assert (PixelNoise(Constant(7), 0).reset(seed=0)[0] == 7).all()
     env = ObservationNoise(gym.make("CartPole-v1"), 0.0)

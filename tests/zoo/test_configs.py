@@ -207,7 +207,20 @@ def test_an_environment_without_settings_says_which_file_which_keys_and_what_to_
         ("CartPole-v1: 3", "must be a mapping of settings"),
         ("CartPole-v1: {policy: MlpPolicy}", "policy must be sb3_sparse.SparsePolicy"),
         ("CartPole-v1: {policy: SparsePolicy, policy_kwargs: 'f()'}", "policy_kwargs must be a"),
-        ("CartPole-v1: {policy: SparsePolicy}", "lack n_timesteps"),
+        ("CartPole-v1: {policy: SparsePolicy}", "needs its sparsity"),
+        ("CartPole-v1: {policy: SparsePolicy, policy_kwargs: {sparsity: 0.5}}", "lack n_timesteps"),
+        (
+            "CartPole-v1: {n_timesteps: 1e6, policy: SparsePolicy, policy_kwargs: {sparsity: 0.5}}",
+            "n_timesteps is the text '1e6'.*!!float 1e6",
+        ),
+        (
+            "CartPole-v1: {n_timesteps: no, policy: SparsePolicy, policy_kwargs: {sparsity: 0.5}}",
+            "n_timesteps must be a number",
+        ),
+        (
+            "CartPole-v1: {policy: SparsePolicy, callback: sb3_sparse.SparsityCallback}",
+            "needs a method",
+        ),
     ],
 )
 def test_a_file_that_is_wrong_says_how(content, message, tmp_path):

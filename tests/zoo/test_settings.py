@@ -48,7 +48,7 @@ def test_policy_kwargs_are_merged_so_that_the_sparsity_is_not_lost():
 
 def test_arguments_of_every_base_class_count():
     settings = base()
-    overrides = {"ortho_init": False, "clip_range": 0.1, "seed": 3, "n_critics": 3}
+    overrides = {"ortho_init": False, "clip_range": 0.1, "n_critics": 3}
     apply_overrides(settings, {"n_critics": 3}, SAC)
     assert settings["policy_kwargs"]["n_critics"] == 3
     with pytest.raises(ConfigError, match="PPO has no hyperparameter 'n_critics'"):
@@ -61,6 +61,8 @@ def test_arguments_of_every_base_class_count():
         ("learning_rat", r"did you mean 'learning_rate'\?"),
         ("update_intervall", r"did you mean 'update_interval'\?"),
         ("env", "has no hyperparameter 'env'"),
+        ("seed", "has no hyperparameter 'seed'"),
+        ("method", "has no hyperparameter 'method'"),
         ("observation_space", "has no hyperparameter"),
         ("xyzzy", r"Of the algorithm: .*tau.* Of the policy: .*sparsity.* schedule: .*update_on"),
     ],
@@ -158,6 +160,33 @@ def test_what_the_user_wants_wins_over_the_config():
 def test_wrong_runs_are_refused(arguments, message):
     with pytest.raises(ConfigError, match=message):
         Run(**arguments).settings()
+
+
+@pytest.mark.parametrize(
+    "run",
+    [
+        Run(method="dense", hyperparams={"sparsity": 0.5}),
+        Run(method="dense", match_params=0.9, hyperparams={"policy_kwargs": {"sparsity": 0.5}}),
+        Run(method="rigl", hyperparams={"callback": None}),
+    ],
+)
+def test_overrides_cannot_turn_a_method_into_another(run):
+    with pytest.raises(ConfigError, match=r"makes this 'static' training, not '(dense|rigl)'"):
+        run.settings()
+
+
+def test_the_callback_is_known_by_any_path():
+    path = "sb3_sparse.callback.SparsityCallback"
+    settings = base(callback=[{path: {"method": "set"}}, "os.path.join", {"no.such.Thing": {}}])
+    assert method_of(settings) == "set"
+    apply_overrides(settings, {"update_interval": 3}, SAC)
+    assert settings["callback"][0] == {path: {"method": "set", "update_interval": 3}}
+
+
+@pytest.mark.parametrize("value", ["1e-3", "fast", "lin_", "lin_x"])
+def test_a_learning_rate_that_is_text_is_explained(value):
+    with pytest.raises(ConfigError, match=r"!!float 1e-3|lin_ and a number"):
+        Run(hyperparams={"learning_rate": value}).settings()
 
 
 def test_a_file_of_ones_own_decides_the_method(tmp_path):

@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 import signal
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch as th
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.monitor import load_results
 from support import ALGORITHMS
 
 from sb3_sparse.errors import ConfigError
@@ -140,7 +142,8 @@ def test_a_stopped_run_goes_on_and_evaluates_every_point_once(run, cls, number, 
     else:
         assert saved.num_timesteps % 128 == 0  # whole rollouts, all learnt from
 
-    monitored = len((folder / "0.monitor.csv").read_text().splitlines())
+    assert saved.num_timesteps == record["num_timesteps"] == stopped.model.num_timesteps
+    monitored = load_results(folder)
     first = Look()
     done = resume(folder, [first])
     assert done.finished
@@ -152,7 +155,13 @@ def test_a_stopped_run_goes_on_and_evaluates_every_point_once(run, cls, number, 
     after = evaluations(folder)
     assert after[0] == list(range(200, run.n_timesteps + 1, 200))
     assert (after[1][: len(before[0])] == before[1]).all()
-    assert len((folder / "0.monitor.csv").read_text().splitlines()) > monitored
+    assert sorted(path.name for path in folder.glob("*.csv")) == [
+        "0.1.monitor.csv",
+        "0.monitor.csv",
+    ]
+    episodes = load_results(folder)
+    assert len(episodes) > len(monitored)
+    assert (episodes["r"][: len(monitored)].values == monitored["r"].values).all()
     assert read_record(folder)["status"] == "finished"
     assert not (folder / "resume").exists()
     assert done.model.num_timesteps >= run.n_timesteps
@@ -169,6 +178,9 @@ class Look(BaseCallback):
     def _on_training_start(self) -> None:
         policy = self.model.policy
         self.steps = self.model.num_timesteps
+        (monitor, *_) = self.training_env.get_attr("results_writer")
+        best = Path(monitor.file_handler.name).with_name("best_model.zip")
+        self.best = best.read_bytes() if best.exists() else None
         self.clocks = [network.clock for network in policy.sparse.networks]
         self.state = {name: value.clone() for name, value in policy.state_dict().items()}
 
@@ -182,9 +194,79 @@ def test_a_second_interrupt_stops_at_once_and_falls_back_to_the_last_evaluation(
     folder = tmp_path / "dqn" / "CartPole-v1_1"
     assert read_record(folder)["status"] == "running"
     assert last_checkpoint(folder).name == "400"
-    outcome = resume(folder)
+    best = (last_checkpoint(folder) / "best_model.zip").read_bytes()
+    (folder / "best_model.zip").write_bytes(b"half a file of a later evaluation")
+    look = Look()
+    outcome = resume(folder, [look])
     assert outcome.finished
+    assert look.best == best
     assert evaluations(folder)[0] == [200, 400, 600, 800, 1000]
+    with (folder / "0.1.monitor.csv").open() as file:
+        lengths = [int(line.split(",")[1]) for line in list(file)[2:]]
+    assert 300 < sum(lengths) <= 400  # what came after the checkpoint is forgotten
+
+
+def test_a_stop_in_the_last_rollout_leaves_the_last_evaluation_for_later(tmp_path):
+    stopped = train(DQN_RUN, tmp_path, [Stop(1000)])
+    assert not stopped.finished
+    assert read_record(stopped.folder)["status"] == "evaluating"
+    assert stopped.model.num_timesteps == 1000
+    monitored = load_results(stopped.folder)
+    assert resume(stopped.folder).finished
+    assert evaluations(stopped.folder)[0] == [200, 400, 600, 800, 1000]
+    assert len(load_results(stopped.folder)) == len(monitored)
+
+
+def test_two_processes_cannot_train_one_run(tmp_path):
+    stopped = train(DQN_RUN, tmp_path, [Stop(300)])
+
+    class Intrude(BaseCallback):
+        def _on_training_start(self) -> None:
+            with pytest.raises(ConfigError, match="another process is training the run"):
+                resume(stopped.folder)
+
+        def _on_step(self) -> bool:
+            return True
+
+    assert resume(stopped.folder, [Intrude()]).finished
+
+
+class Break(BaseCallback):
+    """An environment or a disk that fails."""
+
+    def __init__(self, at: int) -> None:
+        super().__init__()
+        self.at = at
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps == self.at:
+            raise OSError("no space left")
+        return True
+
+
+def test_a_run_that_failed_says_so_and_can_go_on(tmp_path):
+    with pytest.raises(OSError, match="no space left"):
+        train(DQN_RUN, tmp_path, [Break(500)])
+    folder = tmp_path / "dqn" / "CartPole-v1_1"
+    record = read_record(folder)
+    assert (record["status"], record["error"]) == ("failed", "OSError: no space left")
+    assert resume(folder).finished
+    assert read_record(folder)["error"] is None
+
+
+def test_a_run_that_cannot_begin_leaves_nothing(tmp_path):
+    wrong = replace(DQN_RUN, hyperparams={**DQN_RUN.hyperparams, "initial_sparsity": 0.3})
+    with pytest.raises(ConfigError, match="never take it to its sparsity"):
+        train(wrong, tmp_path)
+    assert not list((tmp_path / "dqn").iterdir())
+
+
+@pytest.mark.skipif(th.cuda.is_available(), reason="needs a machine without CUDA")
+def test_a_device_that_is_not_there_is_refused(tmp_path):
+    with pytest.raises(ConfigError, match="no device 'cuda' here"):
+        train(replace(DQN_RUN, device="cuda"), tmp_path)
+    assert train(replace(DQN_RUN, n_timesteps=100), tmp_path).model.device.type == "cpu"
+    assert read_record(tmp_path / "dqn" / "CartPole-v1_1")["device"] == "cpu"
 
 
 def test_a_run_that_died_before_its_first_evaluation_starts_again(tmp_path):
@@ -279,7 +361,7 @@ def test_enjoy_scores_last_and_best_with_the_runs_normalization(tmp_path):
         assert -2000 < score.mean_return < 0
         assert score.std_return > 0
     (outcome.folder / "Pendulum-v1.zip").unlink()
-    with pytest.raises(ConfigError, match=r"has no Pendulum-v1.zip; its models: best_model.zip"):
+    with pytest.raises(ConfigError, match=r"has no Pendulum-v1.zip \(its models: best_model.zip\)"):
         enjoy(outcome.folder)
 
 
