@@ -119,6 +119,11 @@ def train(
             )
             console.print(_headline(run))
             outcome = engine.train(run, log_folder, [progress], tensorboard_log)
+    except KeyboardInterrupt:
+        console.print(
+            "Interrupted. A run that had begun goes on with sb3-sparse train --resume ITS_FOLDER"
+        )
+        raise typer.Exit(INTERRUPTED) from None
     finally:
         progress.close()
     if not outcome.finished:
@@ -208,9 +213,3 @@ def main() -> None:
     except (SparsityError, OSError) as error:
         Console(stderr=True, highlight=False).print(f"Error: {error}", markup=False, soft_wrap=True)
         sys.exit(2)
-    except KeyboardInterrupt:
-        print(
-            "Interrupted; a run that had begun goes on with sb3-sparse train --resume <its folder>",
-            file=sys.stderr,
-        )
-        sys.exit(INTERRUPTED)

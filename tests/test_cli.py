@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import signal
 import subprocess
 import sys
 import time
@@ -66,6 +67,23 @@ def test_a_killed_run_goes_on_from_its_last_evaluation(tmp_path):
     with np.load(folder / "evaluations.npz") as evaluations:
         assert evaluations["timesteps"].tolist() == list(range(300, 3001, 300))
     assert DQN.load(folder / "CartPole-v1.zip").num_timesteps == 3000
+
+
+def test_a_run_that_is_asked_to_stop_says_how_to_go_on(tmp_path):
+    folder = tmp_path / "logs" / "dqn" / "CartPole-v1_1"
+    args = ["-n", "100000", "--eval-freq", "300", "--eval-episodes", "1", *QUICK]
+    code = "from sb3_sparse.cli import main; main()"
+    command = [sys.executable, "-c", code, "train", *args]
+    running = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, text=True)
+    while not list(folder.glob("resume/[0-9]*")):
+        assert running.poll() is None, "it ended before its first checkpoint"
+        time.sleep(0.05)
+    running.send_signal(signal.SIGINT)
+    said, _ = running.communicate(timeout=60)
+    assert running.returncode == 130
+    steps = DQN.load(folder / "CartPole-v1.zip").num_timesteps
+    assert f"Stopped after {steps} steps. Go on with:" in said
+    assert "sb3-sparse train --resume logs/dqn/CartPole-v1_1" in said
 
 
 def test_options_and_a_second_run_beside_the_first(tmp_path):

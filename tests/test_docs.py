@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import re
+import shlex
 from pathlib import Path
 
 import pytest
 from support import assert_masked, make
 
+from sb3_sparse import cli
 from sb3_sparse.topology import registry
+from sb3_sparse.zoo.run import Run
+from sb3_sparse.zoo.train import train
 
 ROOT = Path(__file__).parent.parent
 
@@ -55,3 +59,41 @@ def test_the_readme_has_the_command_that_ci_runs():
     (command,) = re.findall(r"<!-- tests -->\n```sh\n(.*)\n```", text)
     assert "-c constraints.txt" in command
     assert "pytest" in command
+
+
+class Enough(Exception):
+    pass
+
+
+def train_commands() -> list[str]:
+    """Every ``sb3-sparse train`` that the documents show to start a run."""
+    text = "".join((ROOT / path).read_text() for path in ("README.md", "docs/configs.md"))
+    blocks = "".join(re.findall(r"```sh\n(.*?)```", text, re.DOTALL)).replace("\\\n", " ")
+    lines = [line for line in blocks.splitlines() if line.startswith("sb3-sparse train")]
+    return [line for line in lines if "--resume" not in line and "mine.yml" not in line]
+
+
+@pytest.mark.parametrize("command", train_commands())
+def test_the_train_commands_of_the_documents_have_settings(command, monkeypatch):
+    runs = []
+
+    def note(run, *args, **kwargs):
+        runs.append(run)
+        raise Enough
+
+    monkeypatch.setattr("sb3_sparse.zoo.train.train", note)
+    words = shlex.split(command, comments=True)[1:]
+    with pytest.raises(Enough):
+        cli.app(words, standalone_mode=False)
+    (run,) = runs
+    assert run.settings()["n_timesteps"] > 0
+
+
+def test_the_config_of_the_documents_trains(tmp_path):
+    (config,) = re.findall(r"```yaml\n(.*?)```", (ROOT / "docs/configs.md").read_text(), re.DOTALL)
+    path = tmp_path / "mine.yml"
+    path.write_text(config)
+    outcome = train(Run(conf_file=str(path), n_timesteps=200), tmp_path)
+    assert outcome.finished
+    assert outcome.model.learning_rate(1.0) == 1e-3
+    assert abs(outcome.model.policy.sparse.sparsity - 0.95) < 0.001

@@ -15,11 +15,32 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from typing import TypeVar
+from weakref import WeakMethod
 
 import torch as th
 from torch.utils.hooks import RemovableHandle
 
 from sb3_sparse.engine.layers import MaskedLayer
+
+Gradient = TypeVar("Gradient")
+
+
+def weakly(hook: Callable[[th.Tensor], Gradient]) -> Callable[[th.Tensor], Gradient | None]:
+    """The hook without holding on to its object.
+
+    Python's garbage collector does not see through a tensor that torch's C++ side refers to. A hook
+    that held the layer, and so the weight that it hangs on, would keep every model for ever.
+
+    :param hook: a bound method
+    """
+    reference = WeakMethod(hook)
+
+    def call(tensor: th.Tensor) -> Gradient | None:
+        method = reference()
+        return None if method is None else method(tensor)
+
+    return call
 
 
 class GradientMask(ABC):
@@ -48,7 +69,7 @@ class AccumulatedGradient(GradientMask):
 
     def attach(self) -> RemovableHandle:
         weight = self.layer.weight
-        handle: RemovableHandle = weight.register_post_accumulate_grad_hook(self._hook)  # type: ignore[no-untyped-call]
+        handle: RemovableHandle = weight.register_post_accumulate_grad_hook(weakly(self._hook))  # type: ignore[no-untyped-call]
         return handle
 
     def _hook(self, weight: th.Tensor) -> None:
@@ -69,7 +90,7 @@ class FunctionalGradient(GradientMask):
     """For algorithms that also use ``torch.autograd.grad``."""
 
     def attach(self) -> RemovableHandle:
-        handle: RemovableHandle = self.layer.weight.register_hook(self._hook)  # type: ignore[no-untyped-call]
+        handle: RemovableHandle = self.layer.weight.register_hook(weakly(self._hook))  # type: ignore[no-untyped-call]
         return handle
 
     def _hook(self, grad: th.Tensor) -> th.Tensor | None:
