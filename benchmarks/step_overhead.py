@@ -140,11 +140,13 @@ def time_topology_update(width: int, interval: int) -> tuple[float, float]:
     sparse = model.policy.sparse
     moving = []
     for _ in range(3):
-        sparse.plan = plan
+        sparse.start(plan, soft_targets=False, in_force=lambda: True)
+        updates = sparse.networks[0].mask_updates
         start = time.perf_counter()
         train()
         moving.append((time.perf_counter() - start) / steps - step)
-        sparse.plan = None
+        sparse.stop()
+        assert sparse.networks[0].mask_updates == updates + steps
     return median(moving), interval * step
 
 

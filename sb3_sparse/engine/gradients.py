@@ -15,18 +15,16 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import TypeVar
-from weakref import WeakMethod
+from typing import Any
+from weakref import ref
 
 import torch as th
 from torch.utils.hooks import RemovableHandle
 
 from sb3_sparse.engine.layers import MaskedLayer
 
-Gradient = TypeVar("Gradient")
 
-
-def weakly(hook: Callable[[th.Tensor], Gradient]) -> Callable[[th.Tensor], Gradient | None]:
+def weakly(hook: Any) -> Callable[[th.Tensor], Any]:
     """The hook without holding on to its object.
 
     Python's garbage collector does not see through a tensor that torch's C++ side refers to. A hook
@@ -34,11 +32,11 @@ def weakly(hook: Callable[[th.Tensor], Gradient]) -> Callable[[th.Tensor], Gradi
 
     :param hook: a bound method
     """
-    reference = WeakMethod(hook)
+    owner, function = ref(hook.__self__), hook.__func__  # quicker than weakref.WeakMethod
 
-    def call(tensor: th.Tensor) -> Gradient | None:
-        method = reference()
-        return None if method is None else method(tensor)
+    def call(tensor: th.Tensor) -> Any:
+        mask = owner()
+        return None if mask is None else function(mask, tensor)
 
     return call
 
