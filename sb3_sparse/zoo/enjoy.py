@@ -90,13 +90,20 @@ def enjoy(
             mean, std = evaluate_policy(
                 model, env, n_eval_episodes=episodes, deterministic=not is_atari(env_id)
             )
+    except Exception as error:
+        if not video:
+            raise
+        raise ConfigError(
+            f"{env_id} could not be filmed: {type(error).__name__}: {error}. It must render "
+            "'rgb_array'; MuJoCo without a display needs MUJOCO_GL=egl or osmesa and its library"
+        ) from error
     finally:
         with quiet():
             env.close()
-    assert isinstance(mean, float)
-    assert isinstance(std, float)
+    assert not isinstance(mean, list)
+    assert not isinstance(std, list)
     videos = tuple(sorted((folder / "videos").glob(f"{path.stem}*"))) if video else ()
-    return Score(path, mean, std, episodes, videos)
+    return Score(path, float(mean), float(std), episodes, videos)
 
 
 def _arguments_of(folder: Path) -> dict[str, Any]:

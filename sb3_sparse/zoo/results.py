@@ -77,6 +77,6 @@ def _evaluate(
     mean, std = evaluate_policy(
         model, envs, n_eval_episodes=FINAL_EPISODES, deterministic=deterministic
     )
-    assert isinstance(mean, float)
-    assert isinstance(std, float)
-    return Result(what, mean, std, FINAL_EPISODES, path)
+    assert not isinstance(mean, list)
+    assert not isinstance(std, list)
+    return Result(what, float(mean), float(std), FINAL_EPISODES, path)
