@@ -18,9 +18,10 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.zoo.evaluation import Evaluation
 from sb3_sparse.zoo.record import write_record
+from sb3_sparse.zoo.replay import BufferSaver
 
 FOLDER = "resume"
-REPLAY_BUFFER = "replay_buffer.pkl"
+REPLAY_BUFFER = "replay_buffer"
 MONITOR = ".monitor.csv"
 
 
@@ -32,8 +33,8 @@ class Checkpoints(BaseCallback):
     """Saves everything after each evaluation, and stops cleanly when asked.
 
     Saves at the start of a rollout, when all experience has been learnt from. A checkpoint is a
-    folder ``resume/<steps>`` in the layout that rl-zoo's ``--trained-agent`` reads (model, replay
-    buffer, normalisation); it appears whole or not at all, and then the one before goes.
+    folder ``resume/<steps>``; it appears whole or not at all, and then the one before goes. Model
+    and normalisation lie in it as rl-zoo's ``--trained-agent`` reads them.
 
     :param folder: of the run
     :param env_name: file name of the model
@@ -46,8 +47,12 @@ class Checkpoints(BaseCallback):
         self.env_name = env_name
         self.evaluation = evaluation
         self.stop_wanted = False
+        self.buffer: BufferSaver | None = None
 
     def _on_training_start(self) -> None:
+        if isinstance(self.model, OffPolicyAlgorithm):
+            assert self.model.replay_buffer is not None
+            self.buffer = BufferSaver(self.model.replay_buffer)
         self.saved_evaluations = self.evaluation.count
 
     def _on_rollout_start(self) -> None:
@@ -70,8 +75,10 @@ class Checkpoints(BaseCallback):
         shutil.rmtree(new, ignore_errors=True)
         (new / self.env_name).mkdir(parents=True)
         self.model.save(new / f"{self.env_name}.zip")
-        if isinstance(self.model, OffPolicyAlgorithm):
-            self.model.save_replay_buffer(new / REPLAY_BUFFER)
+        if self.buffer is not None:
+            rows = self.model.num_timesteps // self.model.n_envs
+            self.buffer.save(new / REPLAY_BUFFER, rows)
+            self.buffer.last = final / REPLAY_BUFFER
         normalization = self.model.get_vec_normalize_env()
         if normalization is not None:
             normalization.save(str(new / self.env_name / "vecnormalize.pkl"))

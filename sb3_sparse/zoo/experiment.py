@@ -18,6 +18,8 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_sparse.errors import MissingExtra
+from sb3_sparse.zoo.checkpoint import REPLAY_BUFFER
+from sb3_sparse.zoo.replay import restore_buffer
 from sb3_sparse.zoo.run import Run
 
 try:
@@ -95,7 +97,12 @@ class Experiment(ExperimentManager):
         with quiet():
             made = self.setup_experiment()
         assert made is not None  # it is only when optimizing hyperparameters
-        return made[0]
+        model = made[0]
+        buffer = Path(self.trained_agent).parent / REPLAY_BUFFER
+        if isinstance(model, OffPolicyAlgorithm) and self.continue_training and buffer.is_dir():
+            assert model.replay_buffer is not None
+            restore_buffer(model.replay_buffer, buffer)
+        return model
 
     def save(self, model: BaseAlgorithm) -> Path:
         """Save the model as rl-zoo does; where."""

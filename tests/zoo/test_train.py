@@ -19,6 +19,7 @@ from sb3_sparse.errors import ConfigError
 from sb3_sparse.zoo.checkpoint import last_checkpoint
 from sb3_sparse.zoo.enjoy import enjoy
 from sb3_sparse.zoo.record import read_record
+from sb3_sparse.zoo.replay import restore_buffer
 from sb3_sparse.zoo.run import Run, algorithms
 from sb3_sparse.zoo.train import new_run_folder, resume, train
 
@@ -137,7 +138,7 @@ def test_a_stopped_run_goes_on_and_evaluates_every_point_once(run, cls, number, 
     checkpoint = last_checkpoint(folder)
     saved = cls.load(checkpoint / f"{run.env_id}.zip")
     if cls is DQN:
-        saved.load_replay_buffer(checkpoint / "replay_buffer.pkl")
+        restore_buffer(saved.replay_buffer, checkpoint / "replay_buffer")
         assert saved.replay_buffer.size() == saved.num_timesteps
     else:
         assert saved.num_timesteps % 128 == 0  # whole rollouts, all learnt from
