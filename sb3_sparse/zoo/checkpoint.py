@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import signal
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
 
@@ -85,7 +86,9 @@ class Checkpoints(BaseCallback):
         self.evaluation.save(new)
         for path in self.parent_folder.parent.glob(f"*{MONITOR}"):
             shutil.copy(path, new / path.name)
+        _to_disk(*new.rglob("*"), new)
         new.rename(final)
+        _to_disk(self.parent_folder)
         write_record(self.parent_folder.parent, num_timesteps=self.model.num_timesteps)
         for other in self.parent_folder.iterdir():
             if other != final:
@@ -114,6 +117,18 @@ class Checkpoints(BaseCallback):
         finally:
             for number, handler in before.items():
                 signal.signal(number, handler)
+
+
+def _to_disk(*paths: Path) -> None:
+    """Wait until files and folders are on the disk, so that a power cut cannot lose them."""
+    if os.name != "posix":
+        return
+    for path in paths:
+        descriptor = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
 
 
 def last_checkpoint(folder: Path) -> Path | None:
@@ -153,8 +168,9 @@ def locked(folder: Path) -> Iterator[None]:
     try:
         yield
     finally:
+        with suppress(OSError):  # Windows keeps an open file
+            (folder / ".lock").unlink()
         lock.release()
-        (folder / ".lock").unlink(missing_ok=True)
 
 
 def clear_checkpoints(folder: Path) -> None:

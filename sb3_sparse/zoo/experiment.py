@@ -19,7 +19,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_sparse.errors import MissingExtra
 from sb3_sparse.zoo.checkpoint import REPLAY_BUFFER
-from sb3_sparse.zoo.replay import restore_buffer
+from sb3_sparse.zoo.replay import end_episodes, restore_buffer
 from sb3_sparse.zoo.run import Run
 
 try:
@@ -102,6 +102,7 @@ class Experiment(ExperimentManager):
         if isinstance(model, OffPolicyAlgorithm) and self.continue_training and buffer.is_dir():
             assert model.replay_buffer is not None
             restore_buffer(model.replay_buffer, buffer)
+            end_episodes(model.replay_buffer)
         return model
 
     def save(self, model: BaseAlgorithm) -> Path:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from stable_baselines3.common.buffers import BaseBuffer
+from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 ROWS = 10_000  # of one file
@@ -72,10 +72,7 @@ class BufferSaver:
 
 
 def restore_buffer(buffer: BaseBuffer, folder: Path) -> None:
-    """Fill a new buffer of the same kind and size with what was saved.
-
-    An episode that was under way ends there.
-    """
+    """Fill a new buffer of the same kind and size with what was saved."""
     for path in folder.glob("*.npz"):
         with np.load(path) as saved:
             for key, array in _large_arrays(buffer):
@@ -84,8 +81,18 @@ def restore_buffer(buffer: BaseBuffer, folder: Path) -> None:
                 array[begin : begin + len(rows)] = rows
     with (folder / REST).open("rb") as file:
         vars(buffer).update(pickle.load(file))
+
+
+def end_episodes(buffer: BaseBuffer) -> None:
+    """End the episodes that were under way, since what comes next does not follow on them."""
     if isinstance(buffer, HerReplayBuffer):
         buffer.truncate_last_trajectory()
+    elif isinstance(buffer, ReplayBuffer) and buffer.size():
+        newest = buffer.pos - 1
+        if buffer.optimize_memory_usage:  # the row after it will hold another episode
+            buffer.dones[newest] = 1.0
+        if buffer.handle_timeout_termination:  # returns over several steps stop here
+            buffer.timeouts[newest] = 1.0
 
 
 def _large_arrays(buffer: BaseBuffer) -> Iterator[tuple[str, NDArray[Any]]]:

@@ -60,7 +60,8 @@ def train(
     if run.device.startswith("cuda") and not th.cuda.is_available():
         raise ConfigError(f"there is no device {run.device!r} here; give --device auto or cpu")
     settings, evaluation = run.settings(), run.evaluation()
-    with explained(run):
+    failure = f"the settings of {run.env_id} in {run.config}, with what you changed, do not work"
+    with explained(failure, run.env_id):
         observation_space, action_space = spaces_of(
             run, settings, log_folder / run.algo / "new", evaluation
         )
@@ -88,7 +89,7 @@ def train(
         )
         model = None
         try:
-            with explained(run):
+            with explained(failure, run.env_id):
                 experiment = Experiment(run, settings, folder, evaluation, None, tensorboard_log)
                 model = experiment.setup()
             return _learn(run, experiment, model, folder, None, callbacks)
@@ -110,20 +111,25 @@ def resume(folder: Path, callbacks: Sequence[BaseCallback] = ()) -> Outcome:
     with locked(folder):
         record = read_record(folder)
         if record["status"] == "finished":
+            clear_checkpoints(folder)
             raise ConfigError(
                 f"the run in {folder} is finished; look at it with sb3-sparse enjoy {folder}, or "
                 "train longer anew with -n"
             )
         run = Run(**record["run"])
         settings, evaluation = record["settings"], record["evaluation"]
-        observation_space, _ = spaces_of(run, settings, folder, evaluation)
-        use_few_threads(observation_space)
-        start = folder if record["status"] == "evaluating" else last_checkpoint(folder)
-        if start != folder:
-            restore_monitors(folder, start)
-        experiment = Experiment(run, settings, folder, evaluation, start, record["tensorboard_log"])
+        start = folder if record.get("trained") else last_checkpoint(folder)
+        with explained(f"the run in {folder} cannot go on from {start or 'its start'}", run.env_id):
+            observation_space, _ = spaces_of(run, settings, folder, evaluation)
+            use_few_threads(observation_space)
+            if start != folder:
+                restore_monitors(folder, start)
+            experiment = Experiment(
+                run, settings, folder, evaluation, start, record["tensorboard_log"]
+            )
+            model = experiment.setup()
         try:
-            return _learn(run, experiment, experiment.setup(), folder, start, callbacks)
+            return _learn(run, experiment, model, folder, start, callbacks)
         except Exception as error:
             _record_failure(folder, error)
             raise
@@ -179,7 +185,11 @@ def _learn(
                 status = "interrupted"
         path = experiment.save(model)
         write_record(
-            folder, status=status, num_timesteps=model.num_timesteps, **sparsity_of(policy)
+            folder,
+            status=status,
+            trained=status == "evaluating",
+            num_timesteps=model.num_timesteps,
+            **sparsity_of(policy),
         )
         if checkpoints.stop_wanted:
             return Outcome(folder, model, ())
@@ -196,21 +206,21 @@ def _learn(
 
 
 @contextmanager
-def explained(run: Run) -> Iterator[None]:
-    """Turn what environment, zoo and algorithm raise about wrong settings into our errors."""
+def explained(failure: str, env_id: str) -> Iterator[None]:
+    """Turn what environment, zoo and algorithm raise before training into one of our errors.
+
+    :param failure: what does not work then
+    """
     try:
         yield
     except SparsityError:
         raise
     except gym.error.DependencyNotInstalled as error:
         if "mujoco" in str(error).lower():
-            raise MissingExtra(run.env_id, "mujoco") from error
-        raise ConfigError(f"{run.env_id} cannot be made: {error}") from error
-    except (TypeError, ValueError, AssertionError, AttributeError, ImportError) as error:
-        raise ConfigError(
-            f"the settings of {run.env_id} in {run.config}, with what you changed, do not work: "
-            f"{type(error).__name__}: {error}"
-        ) from error
+            raise MissingExtra(env_id, "mujoco") from error
+        raise ConfigError(f"{env_id} cannot be made: {error}") from error
+    except Exception as error:
+        raise ConfigError(f"{failure}: {type(error).__name__}: {error}") from error
 
 
 def check_action_space(run: Run, space: spaces.Space[Any]) -> None:

@@ -15,7 +15,7 @@ from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 from stable_baselines3.common.envs import BitFlippingEnv
 
 import sb3_sparse.zoo.replay as replay
-from sb3_sparse.zoo.replay import BufferSaver, restore_buffer
+from sb3_sparse.zoo.replay import BufferSaver, end_episodes, restore_buffer
 
 VECTOR = spaces.Box(-1, 1, (3,), np.float32)
 DICT = spaces.Dict({"a": VECTOR, "b": spaces.Box(0, 255, (2, 2), np.uint8)})
@@ -106,6 +106,22 @@ def test_a_save_writes_what_is_new_and_links_the_rest(tmp_path, monkeypatch):
     assert [name for name in sorted(files) if files[name] != again[name]] == ["3.npz"]
 
 
+@pytest.mark.parametrize("kind", ["vectors", "one array"])
+def test_an_episode_under_way_is_ended_where_it_was_cut(kind):
+    buffer = KINDS[kind](20)
+    end_episodes(buffer)  # nothing there yet
+    fill(buffer, 7, np.random.default_rng(0))
+    dones, timeouts = buffer.dones.copy(), buffer.timeouts.copy()
+    end_episodes(buffer)
+    assert (buffer.dones[:6] == dones[:6]).all()
+    assert (buffer.timeouts[:6] == timeouts[:6]).all()
+    if kind == "one array":
+        assert (buffer.dones[6] == 1).all()
+    else:
+        assert (buffer.timeouts[6] == 1).all()
+        assert (buffer.dones[6] == dones[6]).all()
+
+
 def test_hindsight_replay_comes_back_without_its_unfinished_episode(tmp_path):
     def make():
         return DQN(
@@ -121,6 +137,7 @@ def test_hindsight_replay_comes_back_without_its_unfinished_episode(tmp_path):
     model.learn(83)
     BufferSaver(model.replay_buffer).save(tmp_path / "her", 83)
     restore_buffer(again.replay_buffer, tmp_path / "her")
+    end_episodes(again.replay_buffer)
     assert again.replay_buffer.full
     lengths = again.replay_buffer.ep_length
     assert (lengths <= 5).all()

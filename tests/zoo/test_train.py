@@ -255,6 +255,31 @@ def test_a_run_that_failed_says_so_and_can_go_on(tmp_path):
     assert read_record(folder)["error"] is None
 
 
+def test_a_checkpoint_that_cannot_be_read_is_named(tmp_path):
+    stopped = train(DQN_RUN, tmp_path, [Stop(500)])
+    (last_checkpoint(stopped.folder) / "CartPole-v1.zip").write_bytes(b"")
+    with pytest.raises(ConfigError, match=r"cannot go on from .*resume/500: ValueError"):
+        resume(stopped.folder)
+
+
+def test_an_environment_that_breaks_loses_nothing_of_a_trained_run(tmp_path, monkeypatch):
+    def die(*args, **kwargs):
+        raise RuntimeError("no simulator")
+
+    monkeypatch.setattr("sb3_sparse.zoo.train.final_results", die)
+    with pytest.raises(RuntimeError, match="no simulator"):
+        train(DQN_RUN, tmp_path)
+    folder = tmp_path / "dqn" / "CartPole-v1_1"
+    for _ in range(2):
+        assert read_record(folder)["status"] == "failed"
+        with pytest.raises(RuntimeError, match="no simulator"):
+            resume(folder)
+    monkeypatch.undo()
+    look = Look()
+    assert resume(folder, [look]).finished
+    assert not hasattr(look, "steps")  # never trained again
+
+
 def test_a_run_that_cannot_begin_leaves_nothing(tmp_path):
     wrong = replace(DQN_RUN, hyperparams={**DQN_RUN.hyperparams, "initial_sparsity": 0.3})
     with pytest.raises(ConfigError, match="never take it to its sparsity"):
