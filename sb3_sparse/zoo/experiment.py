@@ -88,7 +88,12 @@ class Experiment(ExperimentManager):
         return deepcopy(dict(self.settings)), OrderedDict(sorted(deepcopy(self.settings).items()))
 
     def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
-        """As rl-zoo makes them, but the episodes of a run that is trained stay on record."""
+        """As rl-zoo makes them, but the episodes of a run that is trained stay on record.
+
+        Evaluation has the environment's arguments from the settings too, which rl-zoo gives to
+        training alone.
+        """
+        self.eval_env_kwargs = self.env_kwargs
         envs: VecEnv = super().create_envs(n_envs, eval_env, no_log or self.trained)
         return envs
 

@@ -379,6 +379,26 @@ def test_noise_and_other_wrappers_come_from_the_settings(tmp_path):
     assert enjoy(outcome.folder, episodes=2).episodes == 2
 
 
+def test_evaluation_has_the_environments_arguments_too(tmp_path):
+    run = replace(PPO_RUN, hyperparams={**PPO_RUN.hyperparams, "env_kwargs": {"g": 0.0}})
+    made = []
+
+    class Gravity(BaseCallback):
+        def _on_step(self) -> bool:
+            made.extend(self.training_env.get_attr("g"))
+            made.extend(evaluation.eval_env.get_attr("g"))
+            return False
+
+        def _on_training_start(self) -> None:
+            nonlocal evaluation
+            callbacks = self.locals["callback"].callbacks
+            (evaluation,) = (one for one in callbacks if hasattr(one, "eval_env"))
+
+    evaluation = None
+    train(run, tmp_path, [Gravity()])
+    assert set(made) == {0.0}
+
+
 def test_enjoy_scores_last_and_best_with_the_runs_normalization(tmp_path):
     outcome = train(PPO_RUN, tmp_path)
     for best, name in ((False, "Pendulum-v1.zip"), (True, "best_model.zip")):
