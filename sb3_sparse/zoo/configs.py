@@ -86,8 +86,6 @@ def entry_of(path: Path, env_id: str, atari: bool) -> dict[str, Any]:
 
 def evaluation_of(algo: str, env_id: str, atari: bool) -> dict[str, int]:
     """How a run is evaluated: ``eval_freq`` (environment steps) and ``eval_episodes``."""
-    path = config_root() / "evaluation.yml"
-    content = read_yaml(path)
-    suite = content[algo if algo in content else "sac"]
+    suite = read_yaml(config_root() / "evaluation.yml")[algo]
     shared = "atari" if atari else "default"
     return {name: int(value) for name, value in suite.get(env_id, suite[shared]).items()}

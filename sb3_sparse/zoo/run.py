@@ -102,7 +102,6 @@ class Run:
         settings = entry_of(self.config, self.env_id, is_atari(self.env_id))
         settings["policy_kwargs"] = policy_kwargs_of(settings)
         method = method_of(settings)
-        check_values(settings)
         if self.method not in (None, method):
             raise ConfigError(
                 f"{self.config} trains with method {method!r}, not {self.method!r}; leave --method "

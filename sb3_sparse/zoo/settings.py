@@ -132,19 +132,21 @@ def sparsity_callback(settings: Mapping[str, Any], wanted: str = "") -> dict[str
 def _find_callback(settings: Mapping[str, Any]) -> dict[str, Any] | None:
     callbacks = settings.get("callback") or []
     for callback in callbacks if isinstance(callbacks, list) else [callbacks]:
-        if isinstance(callback, dict):
-            ((path, arguments),) = callback.items()
-        else:
-            path, arguments = callback, {}
+        named = callback if isinstance(callback, dict) else {callback: {}}
+        if len(named) != 1:
+            raise ConfigError(
+                f"a callback is one path, with its arguments indented below it, got {callback!r}"
+            )
+        ((path, arguments),) = named.items()
         if _is_ours(path):
-            if "method" not in arguments:
+            if "method" not in (arguments or {}):
                 raise ConfigError(f"{path} needs a method, e.g. {path}: {{method: rigl}}")
             found: dict[str, Any] = arguments
             return found
     return None
 
 
-def _is_ours(path: Any) -> bool:
+def _is_ours(path: str) -> bool:
     try:
         return import_path(path) is SparsityCallback
     except ImportError:

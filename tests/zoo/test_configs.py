@@ -221,6 +221,14 @@ def test_an_environment_without_settings_says_which_file_which_keys_and_what_to_
             "CartPole-v1: {policy: SparsePolicy, callback: sb3_sparse.SparsityCallback}",
             "needs a method",
         ),
+        (
+            "CartPole-v1: {policy: SparsePolicy, callback: {sb3_sparse.SparsityCallback: }}",
+            "needs a method",
+        ),
+        (
+            "CartPole-v1: {policy: SparsePolicy, callback: {sb3_sparse.SparsityCallback: , a: 1}}",
+            "a callback is one path",
+        ),
     ],
 )
 def test_a_file_that_is_wrong_says_how(content, message, tmp_path):
