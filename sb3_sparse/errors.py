@@ -32,3 +32,16 @@ class MissingExtra(SparsityError, ImportError):
 
 class TopologyError(SparsityError, RuntimeError):
     """A topology method asked for an exchange that no mask allows."""
+
+
+class MissingKernels(SparsityError, ImportError):
+    """The compiled kernels that compute on non-zeros are absent or do not fit.
+
+    :param reason: what is wrong with them
+    """
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(
+            f"computing on non-zeros needs compiled kernels: {reason}. Reinstall sb3-sparse on a "
+            "machine with a C compiler (gcc or clang), or use compute='masked'"
+        )

@@ -9,14 +9,8 @@ from typing import Any
 import torch as th
 from torch.utils.hooks import RemovableHandle
 
-from sb3_sparse.engine.gradients import (
-    AccumulatedGradient,
-    FunctionalGradient,
-    GradientMask,
-    follow_mask,
-)
-from sb3_sparse.engine.layers import MaskedLayer
-from sb3_sparse.engine.moments import keep_only
+from sb3_sparse.engine.gradients import GradientMask
+from sb3_sparse.engine.layers import SparseLayer
 from sb3_sparse.engine.network import SparseNetwork
 from sb3_sparse.engine.optimizers import add_weight_decay, keep_implementation
 from sb3_sparse.engine.plan import Plan
@@ -70,7 +64,7 @@ class Controller:
         }
 
     @property
-    def layers(self) -> Iterable[MaskedLayer]:
+    def layers(self) -> Iterable[SparseLayer]:
         """Every sparse layer once."""
         return (layer for network in self.networks for layer in network.layers)
 
@@ -93,9 +87,10 @@ class Controller:
             return
         for handle in self._handles:
             handle.remove()
-        kind = FunctionalGradient if self.functional_gradients else AccumulatedGradient
         self._gradient_masks = {
-            layer.name: kind(layer, partial(self._capturing, network))
+            layer.name: layer.gradient_mask(
+                self.functional_gradients, partial(self._capturing, network)
+            )
             for network in self.networks
             for layer in network.layers
         }
@@ -105,6 +100,7 @@ class Controller:
                 optimizer.register_step_pre_hook(self._before_step),
                 optimizer.register_load_state_dict_pre_hook(keep_implementation),
                 optimizer.register_load_state_dict_post_hook(self._after_load),
+                optimizer.register_state_dict_post_hook(self._saved_form),
             ]
         self._hooked = list(hooked)
 
@@ -163,9 +159,11 @@ class Controller:
             if network.optimizer is not optimizer:
                 continue
             network.clock += 1
-            self._mask_moments(network)
-            if self.functional_gradients:
-                _remask_moved_by_hand(network)
+            for layer in network.layers:
+                if layer.moments_stale:  # a shared extractor may have moments in several
+                    layer.settle_moments(self.optimizers)
+                if self.functional_gradients and layer.weight.grad is None:
+                    layer.remask()  # TRPO wrote it, from a direction that begins with noise
             if self.plan is not None:
                 self._update_if_due(network, self.plan)
             if self.weight_decay:
@@ -180,19 +178,21 @@ class Controller:
             else:
                 network.pending = gradients
 
-    def _mask_moments(self, network: SparseNetwork) -> None:
-        for layer in network.layers:
-            if layer.moments_stale:
-                self._keep_moments(layer, layer.float_mask)
-                layer.moments_stale = False
-
-    def _keep_moments(self, layer: MaskedLayer, kept: th.Tensor) -> None:
-        for optimizer in self.optimizers:  # a shared extractor may have moments in several
-            keep_only(optimizer, layer.weight, kept)
-
     def _after_load(self, optimizer: th.optim.Optimizer) -> None:
         for layer in self.layers:
             layer.moments_stale = True
+
+    def _saved_form(self, optimizer: th.optim.Optimizer, state_dict: dict[str, Any]) -> None:
+        """State_dict hook: moments look the same whatever the storage."""
+        parameters = [p for group in optimizer.param_groups for p in group["params"]]
+        numbers = {id(parameter): number for number, parameter in enumerate(parameters)}
+        for layer in self.layers:
+            number = numbers.get(id(layer.weight))
+            if layer.compact and number in state_dict["state"]:
+                state_dict["state"][number] = {
+                    key: layer.saved_moment(value) if isinstance(value, th.Tensor) else value
+                    for key, value in state_dict["state"][number].items()
+                }
 
     def _move(
         self, network: SparseNetwork, plan: Plan, gradients: dict[str, th.Tensor | None]
@@ -210,26 +210,14 @@ class Controller:
             exchange = plan.topology.exchange(layer, moment, dense_grad=dense_grad)
             if not exchange:
                 continue
-            old_mask = layer.float_mask.clone()
-            kept = layer.drop_grow(exchange)
-            self._keep_moments(layer, kept)
-            if self.soft_targets:
-                layer.mask_targets()
-            if plan.update_on == "step":
-                follow_mask(layer.weight.grad, gradient, old_mask, layer.float_mask)
+            layer.move(
+                exchange,
+                self.optimizers,
+                soft_targets=self.soft_targets,
+                dense_grad=gradient if plan.update_on == "step" else None,
+            )
             dropped += exchange.dropped.size
             grown += exchange.grown.size
         if dropped or grown:
             network.mask_updates += 1
             network.churn = dropped / nnz
-
-
-def _remask_moved_by_hand(network: SparseNetwork) -> None:
-    """TRPO writes the actor's weights itself, just before the critic's steps.
-
-    Its conjugate gradient starts from noise, so a trace of that is left where nothing is active.
-    """
-    with th.no_grad():
-        for layer in network.layers:
-            if layer.weight.grad is None and not layer.full:
-                layer.weight.mul_(layer.float_mask)

@@ -15,13 +15,15 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from weakref import ref
 
 import torch as th
 from torch.utils.hooks import RemovableHandle
 
-from sb3_sparse.engine.layers import MaskedLayer
+if TYPE_CHECKING:
+    from sb3_sparse.engine.layers import SparseLayer
+    from sb3_sparse.engine.masked import MaskedLayer
 
 
 def weakly(hook: Any) -> Callable[[th.Tensor], Any]:
@@ -48,7 +50,7 @@ class GradientMask(ABC):
     :param capturing: whether the dense gradient will be wanted at the next step
     """
 
-    def __init__(self, layer: MaskedLayer, capturing: Callable[[], bool]) -> None:
+    def __init__(self, layer: SparseLayer, capturing: Callable[[], bool]) -> None:
         self.layer = layer
         self.capturing = capturing
         self.dense_grad: th.Tensor | None = None
@@ -64,6 +66,8 @@ class GradientMask(ABC):
 
 class AccumulatedGradient(GradientMask):
     """For algorithms that call ``backward()``."""
+
+    layer: MaskedLayer
 
     def attach(self) -> RemovableHandle:
         weight = self.layer.weight
@@ -86,6 +90,8 @@ class AccumulatedGradient(GradientMask):
 
 class FunctionalGradient(GradientMask):
     """For algorithms that also use ``torch.autograd.grad``."""
+
+    layer: MaskedLayer
 
     def attach(self) -> RemovableHandle:
         handle: RemovableHandle = self.layer.weight.register_hook(weakly(self._hook))  # type: ignore[no-untyped-call]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -9,46 +11,30 @@ import torch as th
 from numpy.typing import NDArray
 from torch import nn
 
+from sb3_sparse.engine.gradients import GradientMask
 from sb3_sparse.engine.kernels import Kernel
 from sb3_sparse.errors import TopologyError
 from sb3_sparse.topology import Exchange
 
-MASK_KEY = "weight_mask"
-FLOAT_MASK_KEY = "weight_mask_float"
 
-
-def _ignore_mask_key(
-    module: nn.Module, state_dict: dict[str, Any], prefix: str, *_: object
-) -> None:
-    """Pre-load hook of a target layer, which has no mask of its own."""
-    state_dict.pop(prefix + MASK_KEY, None)
-
-
-class MaskedLayer:
-    """A layer stored as its dense weight, 0 where inactive, and a boolean mask.
-
-    The mask is the buffer ``weight_mask`` of the module and so rides in its state_dict; a float
-    copy that does not is what gradients are multiplied with. Whenever a state_dict is loaded, at
-    any level, the weight is masked again.
+class SparseLayer(ABC):
+    """A layer of a network within its budget.
 
     :param name: dotted name within the policy
     :param module: the Linear or Conv layer; it stays in place
+    :param shape: of the dense weight
     """
 
-    def __init__(self, name: str, module: Kernel) -> None:
+    def __init__(self, name: str, module: Kernel, shape: tuple[int, ...]) -> None:
         self.name = name
         self.module = module
-        self.shape = tuple(module.weight.shape)
-        self.size = module.weight.numel()
+        self.shape = shape
+        self.size = int(np.prod(shape, dtype=np.int64))
         self.nnz = self.size
         self.initial_nnz = self.size
         self.final_nnz = self.size
-        self.targets: list[Kernel] = []
         self.moments_stale = False
-        ones = th.ones_like(module.weight, requires_grad=False)
-        module.register_buffer(MASK_KEY, ones.bool())
-        module.register_buffer(FLOAT_MASK_KEY, ones, persistent=False)
-        module.register_load_state_dict_post_hook(self._after_load)  # type: ignore[no-untyped-call]
+        """Whether an optimizer may remember what does not fit the mask."""
 
     @property
     def weight(self) -> nn.Parameter:
@@ -63,72 +49,72 @@ class MaskedLayer:
         return self.nnz == self.size
 
     @property
-    def float_mask(self) -> th.Tensor:
-        """1.0 where active, else 0.0, in the weight's shape and on its device."""
-        # Not through attribute lookup of nn.Module: this is read for every gradient.
-        mask = self.module._buffers[FLOAT_MASK_KEY]
-        assert mask is not None
-        return mask
+    @abstractmethod
+    def targets(self) -> Sequence[Kernel]:
+        """Target copies of the layer."""
 
+    @property
+    @abstractmethod
+    def compact(self) -> bool:
+        """Whether only active connections are stored and computed."""
+
+    @abstractmethod
     def mask(self) -> NDArray[np.bool_]:
         """True where a connection is active, shape ``(size,)``; a copy."""
-        mask = self.module.get_buffer(MASK_KEY)
-        return np.array(mask.cpu().numpy().ravel(), dtype=np.bool_)
 
+    @abstractmethod
     def dense(self) -> NDArray[np.float32]:
         """The weights, 0 where inactive, shape ``(size,)``."""
-        array: NDArray[np.float32] = self.weight.detach().cpu().numpy().ravel()
-        return array
 
-    def add_target(self, module: Kernel) -> None:
-        """Make ``module`` a target copy of this layer; it takes the weights that the layer has."""
-        self.targets.append(module)
-        module.register_load_state_dict_pre_hook(_ignore_mask_key)  # type: ignore[no-untyped-call]
-        self.sync_targets()
-
-    def sync_targets(self) -> None:
-        """Copy the weights into every target."""
-        with th.no_grad():
-            for target in self.targets:
-                target.weight.copy_(self.weight)
-
+    @abstractmethod
     def mask_targets(self) -> None:
         """Set to 0 what the mask has inactive in every target."""
-        with th.no_grad():
-            for target in self.targets:
-                target.weight.mul_(self.float_mask)
 
-    def set_mask(self, mask: NDArray[np.bool_]) -> None:
-        """Replace the mask and set what it has inactive to 0.
+    @abstractmethod
+    def remask(self) -> None:
+        """Set to 0 what the mask has inactive, after somebody wrote the weight."""
 
-        :param mask: shape ``(size,)`` or the weight's shape
+    @abstractmethod
+    def gradient_mask(self, functional: bool, capturing: Callable[[], bool]) -> GradientMask:
+        """What keeps gradients true to the mask.
+
+        :param functional: whether the algorithm uses ``torch.autograd.grad``
+        :param capturing: whether the dense gradient will be wanted at the next step
         """
-        buffer = self.module.get_buffer(MASK_KEY)
-        buffer.copy_(th.from_numpy(np.ascontiguousarray(mask)).view(self.shape))
-        self.apply_mask()
 
-    def set_weights(self, weights: NDArray[np.float32]) -> None:
-        """Replace the active weights; what is inactive stays 0.
+    @abstractmethod
+    def settle_moments(self, optimizers: Sequence[th.optim.Optimizer]) -> None:
+        """Bring what optimizers remember in line with mask and storage."""
 
-        :param weights: shape ``(size,)`` or the weight's shape
-        """
-        with th.no_grad():
-            self.weight.copy_(th.from_numpy(np.ascontiguousarray(weights)).view(self.shape))
-        self.apply_mask()
+    @abstractmethod
+    def saved_moment(self, moment: th.Tensor) -> th.Tensor:
+        """What a state_dict shows for something an optimizer remembers of the weight."""
 
-    def apply_mask(self) -> None:
-        """Bring float mask, nnz and weight in line with the boolean mask."""
-        mask = self.module.get_buffer(MASK_KEY)
-        self.float_mask.copy_(mask)
-        self.nnz = int(mask.sum())
-        with th.no_grad():
-            self.weight.mul_(self.float_mask)
+    @abstractmethod
+    def _move(
+        self,
+        exchange: Exchange,
+        mask: NDArray[np.bool_],
+        optimizers: Sequence[th.optim.Optimizer],
+        soft_targets: bool,
+        dense_grad: th.Tensor | None,
+    ) -> None: ...
 
-    def drop_grow(self, exchange: Exchange) -> th.Tensor:
-        """Move connections. Grown ones start at 0.
+    def move(
+        self,
+        exchange: Exchange,
+        optimizers: Sequence[th.optim.Optimizer] = (),
+        *,
+        soft_targets: bool = True,
+        dense_grad: th.Tensor | None = None,
+    ) -> None:
+        """Move connections. Grown ones start at 0, moments too; the gradient follows the mask.
 
         :param exchange: what to drop (must be active) and to grow (must be inactive)
-        :return: 1.0 where a connection was active before and still is, in the weight's shape
+        :param optimizers: whose moments of the weight shall follow
+        :param soft_targets: whether targets follow at once or keep their snapshot
+        :param dense_grad: dense gradient of the step that is about to be taken, before clipping, to
+            give the grown their share; None: they get none
         :raises TopologyError: if the exchange does not fit the mask or would leave it empty
         """
         mask = self.mask()
@@ -148,10 +134,20 @@ class MaskedLayer:
                 f"{self.nnz} connections, but some of the dropped are not active, some of the "
                 "grown are, an index stands twice, or no connection would be left"
             )
-        before = self.float_mask.clone()
-        self.set_mask(after)
-        return before.mul_(self.float_mask)
+        self._move(exchange, after, optimizers, soft_targets, dense_grad)
 
-    def _after_load(self, module: nn.Module, incompatible_keys: object) -> None:
-        self.apply_mask()
-        self.moments_stale = True
+
+def moments_of(
+    optimizers: Sequence[th.optim.Optimizer], weight: nn.Parameter
+) -> list[tuple[dict[str, Any], str, th.Tensor]]:
+    """Every tensor with dimensions that an optimizer remembers of ``weight``, and its place.
+
+    Adam's two moments, RMSprop's, a momentum buffer; not the step count.
+    """
+    return [
+        (state, key, value)
+        for optimizer in optimizers
+        if (state := optimizer.state.get(weight))
+        for key, value in state.items()
+        if isinstance(value, th.Tensor) and value.dim()
+    ]

@@ -9,7 +9,8 @@ from torch import nn
 
 from sb3_sparse.engine.gradients import GradientMask
 from sb3_sparse.engine.kernels import Kernel
-from sb3_sparse.engine.layers import MaskedLayer
+from sb3_sparse.engine.layers import SparseLayer
+from sb3_sparse.engine.masked import MaskedLayer
 from sb3_sparse.sparsity.distributions import active_counts
 from sb3_sparse.sparsity.initialisation import random_mask, sparsity_aware_weights
 
@@ -32,7 +33,9 @@ class SparseNetwork:
     ) -> None:
         self.name = name
         self.owner = owner
-        self.layers = [MaskedLayer(layer_name, module) for layer_name, module in kernels]
+        self.layers: list[SparseLayer] = [
+            MaskedLayer(layer_name, module) for layer_name, module in kernels
+        ]
         self.dense_kernels = list(dense_kernels)
         self.clock = 0
         """Gradient steps that the owning optimizer has begun."""
@@ -100,6 +103,7 @@ class SparseNetwork:
             layer.initial_nnz = max(initial_nnz, final_nnz)
             if initial_sparsity == 0.0:
                 continue
+            assert isinstance(layer, MaskedLayer)  # every network begins so
             mask = random_mask(layer.shape, layer.initial_nnz, seed, layer.name)
             layer.set_mask(mask)
             if gains is not None:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from torch import nn
 
 from sb3_sparse.engine.kernels import KERNEL_TYPES, find_kernels
+from sb3_sparse.engine.masked import MaskedLayer
 from sb3_sparse.engine.network import SparseNetwork
 from sb3_sparse.errors import ConfigError, UnsupportedError
 from sb3_sparse.policies.config import SparsityConfig
@@ -151,4 +152,5 @@ def _add_targets(
                 continue
             assert isinstance(target, KERNEL_TYPES)
             done.add(id(target))
+            assert isinstance(layer, MaskedLayer)
             layer.add_target(target)

@@ -129,7 +129,7 @@ class SparsePolicyMixin(BasePolicy):
         """As in SB3; what the masks have inactive stays 0."""
         super().load_from_vector(vector)
         for layer in self.sparse.layers:
-            layer.apply_mask()
+            layer.remask()
             layer.mask_targets()
 
     def load_state_dict(

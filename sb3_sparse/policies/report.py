@@ -116,25 +116,26 @@ def report_on(policy: SparsePolicyMixin) -> SparsityReport:
     activated = _activated(policy)
     layers = []
     for network in policy.sparse.networks:
-        kernels: list[tuple[str, Kernel, int, bool]] = [
-            (layer.name, layer.module, layer.nnz, True) for layer in network.layers
+        kernels: list[tuple[str, Kernel, tuple[int, ...], int, bool]] = [
+            (layer.name, layer.module, layer.shape, layer.nnz, True) for layer in network.layers
         ]
         kernels += [
-            (n, module, module.weight.numel(), False) for n, module in network.dense_kernels
+            (name, module, tuple(module.weight.shape), module.weight.numel(), False)
+            for name, module in network.dense_kernels
         ]
-        for name, module, nnz, in_budget in kernels:
+        for name, module, shape, nnz, in_budget in kernels:
             biases = 0 if module.bias is None else module.bias.numel()
-            units = module.weight.shape[0] if id(module) in activated else 0
+            units = shape[0] if id(module) in activated else 0
             places = positions.get(id(module), 1)
             layers.append(
                 LayerReport(
                     network=network.name,
                     name=name,
-                    shape=tuple(module.weight.shape),
+                    shape=shape,
                     nnz=nnz,
                     parameters=nnz + biases,
                     flops=places * (2 * nnz + biases + units),
-                    dense_flops=places * (2 * module.weight.numel() + biases + units),
+                    dense_flops=places * (2 * math.prod(shape) + biases + units),
                     in_budget=in_budget,
                 )
             )

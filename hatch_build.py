@@ -1,0 +1,104 @@
+"""Build hook: compiles the sparse kernels into one library that no Python version is tied to.
+
+Without a C compiler the package is built all the same, without the library.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import shutil
+import subprocess
+import sys
+import sysconfig
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from hatchling.builders.hooks.plugin.interface import BuildHookInterface
+
+NATIVE = Path("sb3_sparse", "engine", "native")
+LIBRARY = NATIVE / "kernels.so"
+FLAGS = [
+    "-std=gnu11",
+    "-O3",
+    "-ffp-contract=fast",
+    "-fPIC",
+    "-fvisibility=hidden",
+    "-Wall",
+    "-Wextra",
+]
+AVX2 = ["-mavx2", "-mfma"]
+AVX512 = [*AVX2, "-mavx512f", "-mavx512dq", "-mavx512vl", "-mavx512bw"]
+
+
+def compiler() -> list[str] | None:
+    """The C compiler's command: ``CC``, else the first that is there."""
+    if os.environ.get("CC"):
+        return os.environ["CC"].split()
+    found = next(filter(None, map(shutil.which, ("cc", "gcc", "clang"))), None)
+    return None if found is None else [found]
+
+
+def compile_kernels(source: Path, library: Path, extra: tuple[str, ...] = ()) -> None:
+    """Compile the C files of ``source`` into ``library``.
+
+    :param extra: further flags, e.g. ``-fsanitize=address``
+    :raises OSError: if there is no compiler
+    :raises subprocess.CalledProcessError: if it fails
+    """
+    command = compiler()
+    if command is None:
+        raise OSError("no C compiler (cc, gcc or clang) was found, and CC is not set")
+    variants: dict[str, list[str]] = {"plain": []}
+    if platform.machine().lower() in ("x86_64", "amd64"):
+        variants.update(avx2=AVX2, avx512=AVX512)
+    with tempfile.TemporaryDirectory() as folder:
+        objects = []
+        for suffix, flags in variants.items():
+            objects.append(str(Path(folder, f"{suffix}.o")))
+            subprocess.run(
+                [*command, *FLAGS, *flags, *extra, f"-DSUFFIX={suffix}", "-c",
+                 str(source / "kernels.c"), "-o", objects[-1]],
+                check=True, capture_output=True, text=True,
+            )  # fmt: skip
+        made = Path(folder, library.name)
+        subprocess.run(
+            [*command, *FLAGS, *extra, "-shared", str(source / "dispatch.c"), *objects, "-o",
+             str(made), "-pthread"],
+            check=True, capture_output=True, text=True,
+        )  # fmt: skip
+        # Not over the old one, which a running process may have mapped.
+        library.unlink(missing_ok=True)
+        shutil.move(made, library)
+
+
+class KernelsHook(BuildHookInterface[Any]):
+    """Compiles beside the sources, so that editable installs find the library too."""
+
+    def initialize(self, version: str, build_data: dict[str, Any]) -> None:
+        """As in hatchling: called before the wheel is put together."""
+        root = Path(self.root)
+        library = root / LIBRARY
+        library.unlink(missing_ok=True)
+        try:
+            compile_kernels(root / NATIVE, library)
+        except (OSError, subprocess.CalledProcessError) as error:
+            reason = getattr(error, "stderr", None) or str(error)
+            self.app.display_warning(
+                "sb3_sparse: the sparse kernels were not compiled, so policies compute with masks "
+                f"(compute='sparse' will say so): {reason}"
+            )
+            return
+        build_data["artifacts"].append(LIBRARY.as_posix())
+        build_data["pure_python"] = False
+        target = sysconfig.get_platform().replace("-", "_").replace(".", "_")
+        build_data["tag"] = f"py3-none-{target}"
+
+
+if __name__ == "__main__":  # python hatch_build.py: compile in place, for work on the C code
+    here = Path(__file__).parent
+    try:
+        compile_kernels(here / NATIVE, here / LIBRARY, tuple(sys.argv[1:]))
+    except subprocess.CalledProcessError as error:
+        sys.exit(error.stderr)

@@ -1,0 +1,218 @@
+"""The second storage: the active connections only."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import torch as th
+from numpy.typing import NDArray
+from torch import nn
+
+from sb3_sparse.engine.gradients import GradientMask, weakly
+from sb3_sparse.engine.layers import SparseLayer, moments_of
+from sb3_sparse.engine.linear import CompactLinear
+from sb3_sparse.engine.masked import MaskedLayer
+from sb3_sparse.engine.structure import Structure
+from sb3_sparse.topology import Exchange
+
+
+class CompactLayer(SparseLayer):
+    """A linear layer stored as the values of its active connections and their indices.
+
+    :param layer: the same layer, masked; it is taken apart
+    :param optimizers: whose moments of the weight shall follow
+    """
+
+    module: CompactLinear
+
+    def __init__(self, layer: MaskedLayer, optimizers: Sequence[th.optim.Optimizer] = ()) -> None:
+        assert isinstance(layer.module, nn.Linear)
+        super().__init__(layer.name, layer.module, layer.shape)
+        self.initial_nnz, self.final_nnz = layer.initial_nnz, layer.final_nnz
+        self.nnz = layer.nnz
+        structure = Structure.of_mask(layer.mask(), (self.shape[0], self.shape[1]))
+        self._structure = structure
+        """What targets and moments go by; differs from the module's after a load."""
+        layer.release()
+        self.module = CompactLinear.convert(layer.module, structure, is_target=False)
+        self._targets = []
+        for target in layer.targets:
+            assert isinstance(target, nn.Linear)
+            self._targets.append(CompactLinear.convert(target, structure, is_target=True))
+        self.module.register_load_state_dict_post_hook(self._after_load)  # type: ignore[no-untyped-call]
+        self.settle_moments(optimizers)
+
+    @property
+    def targets(self) -> Sequence[CompactLinear]:
+        return self._targets
+
+    @property
+    def compact(self) -> bool:
+        return True
+
+    def mask(self) -> NDArray[np.bool_]:
+        return self.module.structure.mask()
+
+    def dense(self) -> NDArray[np.float32]:
+        array: NDArray[np.float32] = self.module.dense().numpy().ravel()
+        return array
+
+    def mask_targets(self) -> None:
+        for target in self._targets:
+            dense = target.dense().view(-1)
+            target.restructure(self.module.structure, dense[self._flat()])
+
+    def remask(self) -> None:
+        """There is nothing inactive to set to 0."""
+
+    def gradient_mask(self, functional: bool, capturing: Callable[[], bool]) -> GradientMask:
+        return CompactGradient(self, functional, capturing)
+
+    def settle_moments(self, optimizers: Sequence[th.optim.Optimizer]) -> None:
+        structure = self.module.structure
+        places = None if structure is self._structure else _carried(structure, self._structure)
+        for state, key, value in moments_of(optimizers, self.weight):
+            if tuple(value.shape) == self.shape:
+                state[key] = value.reshape(-1)[self._flat()]
+            elif places is not None:
+                state[key] = places(value)
+        self._structure = structure
+        self.moments_stale = False
+
+    def saved_moment(self, moment: th.Tensor) -> th.Tensor:
+        if moment.shape != (self._structure.nnz,):
+            return moment
+        dense = th.zeros(self.size, dtype=moment.dtype)
+        dense[th.from_numpy(self._structure.flat)] = moment
+        return dense.view(self.shape)
+
+    def _flat(self) -> th.Tensor:
+        return th.from_numpy(self.module.structure.flat)
+
+    def _move(
+        self,
+        exchange: Exchange,
+        mask: NDArray[np.bool_],
+        optimizers: Sequence[th.optim.Optimizer],
+        soft_targets: bool,
+        dense_grad: th.Tensor | None,
+    ) -> None:
+        if self.moments_stale:
+            self.settle_moments(optimizers)
+        before = self.module.structure
+        after = Structure.of_mask(mask, before.shape)
+        carried = _carried(after, before)
+        grad = self.weight.grad
+        if grad is not None:
+            grad = _followed(grad, dense_grad, before, after, carried)
+        for target in self._targets:
+            if soft_targets:
+                target.restructure(after, carried(target.weight.detach()))
+            else:
+                target.await_copy(after)
+        self.module.restructure(after, carried(self.weight.detach()))
+        self.weight.grad = grad
+        for state, key, value in moments_of(optimizers, self.weight):
+            if value.shape == (before.nnz,):
+                state[key] = carried(value)
+        self._structure = after
+        self.nnz = after.nnz
+
+    def _after_load(self, module: nn.Module, incompatible_keys: object) -> None:
+        structure = self.module.structure
+        self.nnz = structure.nnz
+        self.moments_stale = True
+        for target in self._targets:
+            if target.structure is not structure:
+                dense = target.dense()
+                target.structure = structure
+                target._take(dense)
+
+
+class CompactGradient(GradientMask):
+    """Hears of a compact layer's dense gradient while the kernels go back through it.
+
+    :param functional: whether the algorithm uses ``torch.autograd.grad``: the first gradient is the
+        one wanted then, else the last
+    """
+
+    layer: CompactLayer
+
+    def __init__(
+        self, layer: CompactLayer, functional: bool, capturing: Callable[[], bool]
+    ) -> None:
+        super().__init__(layer, capturing)
+        self.functional = functional
+        self._arriving: th.Tensor | None = None
+
+    def attach(self) -> Any:
+        self.layer.module.listener = self
+        weight: Any = self.layer.weight
+        return weight.register_post_accumulate_grad_hook(weakly(self._arrived))
+
+    def wanted(self) -> bool:
+        """Whether the next step moves the mask."""
+        return self.capturing() and not (self.functional and self.dense_grad is not None)
+
+    def note(self, dense_grad: th.Tensor) -> None:
+        """Take a dense gradient; several of one backward pass add up."""
+        if self.functional:
+            self.dense_grad = dense_grad
+        elif self._arriving is None:
+            self._arriving = dense_grad
+        else:
+            self._arriving += dense_grad
+
+    def _arrived(self, weight: th.Tensor) -> None:
+        if self._arriving is None:
+            return
+        assert weight.grad is not None
+        self.dense_grad, self._arriving = self._arriving, None
+        # What is active may have been added to an earlier backward pass.
+        self.dense_grad.view(-1)[th.from_numpy(self.layer.module.structure.flat)] = weight.grad
+
+    def take(self) -> th.Tensor | None:
+        dense_grad = self.dense_grad
+        if self.layer.weight.grad is not None or not self.functional:
+            self.dense_grad = None
+        return None if self.layer.weight.grad is None and not self.functional else dense_grad
+
+
+def _carried(after: Structure, before: Structure) -> Callable[[th.Tensor], th.Tensor]:
+    """A function that takes values of one structure to another: what is new there is 0."""
+    places = th.from_numpy(after.places_in(before))
+    kept = places >= 0
+    places.clamp_(min=0)
+
+    def carry(values: th.Tensor) -> th.Tensor:
+        return th.where(kept, values[places], 0.0)
+
+    return carry
+
+
+def _followed(
+    grad: th.Tensor,
+    dense_grad: th.Tensor | None,
+    before: Structure,
+    after: Structure,
+    carried: Callable[[th.Tensor], th.Tensor],
+) -> th.Tensor:
+    """As :func:`~sb3_sparse.engine.gradients.follow_mask`, on the values."""
+    moved = carried(grad)
+    if dense_grad is None:
+        return moved
+    flat = dense_grad.reshape(-1)
+    active = flat[th.from_numpy(before.flat)]
+    square = th.dot(active, active)
+    scale = th.where(square > 0, th.dot(grad, active) / square, 1.0)
+    grown = th.from_numpy(after.places_in(before)) < 0
+    return th.where(grown, scale * flat[th.from_numpy(after.flat)], moved)
+
+
+def compacted(layer: SparseLayer, optimizers: Sequence[th.optim.Optimizer]) -> SparseLayer:
+    """The layer in compact storage; one that is not linear, or compact already, as it is."""
+    if isinstance(layer, MaskedLayer) and type(layer.module) is nn.Linear:
+        return CompactLayer(layer, optimizers)
+    return layer

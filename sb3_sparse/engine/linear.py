@@ -1,0 +1,158 @@
+"""A linear layer that stores and computes its active connections only."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import torch as th
+from torch import nn
+
+from sb3_sparse.engine.chains import Chain
+from sb3_sparse.engine.structure import Structure
+from sb3_sparse.errors import CorruptStateError
+
+MASK_KEY = "weight_mask"
+AWAITING = float(th.finfo(th.float32).max)
+"""Value of a hard target's weights from a move of the mask to the next copy; no weight has it."""
+
+
+class Listener(Protocol):
+    """Wants a layer's dense gradient now and then."""
+
+    def wanted(self) -> bool:
+        """Whether it is worth computing in this backward pass."""
+
+    def note(self, dense_grad: th.Tensor) -> None:
+        """Take it, in the weight's dense shape."""
+
+
+class CompactLinear(nn.Linear):
+    """``nn.Linear`` whose Parameter ``weight`` holds the values of the active connections.
+
+    It has shape ``(nnz,)``, by rows; where they are says ``structure``. In a state_dict it is what
+    a masked layer is: the dense weight, and (unless it is a target's) the boolean ``weight_mask``.
+
+    Made by :meth:`convert` out of a linear layer that stays in place.
+    """
+
+    weight: nn.Parameter
+    structure: Structure
+    snapshot: tuple[Structure, th.Tensor] | None
+    """What a hard target computes with until its next copy, if the mask moved since the last."""
+    is_target: bool
+    listener: Listener | None
+
+    @classmethod
+    def convert(cls, module: nn.Linear, structure: Structure, is_target: bool) -> CompactLinear:
+        """Make ``module`` compact, in place; its Parameter stays the same object."""
+        dense = module.weight.detach()
+        module.__class__ = cls  # the usual trick, also of torch's own parametrizations
+        assert isinstance(module, cls)
+        module.structure = structure
+        module.snapshot = None
+        module.is_target = is_target
+        module.listener = None
+        module.weight.grad = None
+        module._take(dense)
+        return module
+
+    def __getstate__(self) -> dict[str, Any]:
+        # A copy's listener is put up when its own hooks are.
+        return {**self.__dict__, "listener": None}
+
+    def forward(self, input: th.Tensor) -> th.Tensor:
+        """As of ``nn.Linear``."""
+        return Chain([self], [False])(input)
+
+    def live(self) -> tuple[Structure, th.Tensor]:
+        """The connections to compute with now, and their values."""
+        if self.snapshot is not None:
+            if self.weight.detach()[0].item() == AWAITING:
+                return self.snapshot
+            self.snapshot = None  # the online network has been copied since
+        return self.structure, self.weight
+
+    def dense(self) -> th.Tensor:
+        """The weights, 0 where inactive, shape ``(rows, columns)``."""
+        structure, values = self.live()
+        weight = th.zeros(structure.shape[0] * structure.shape[1])
+        weight[th.from_numpy(structure.flat)] = values.detach()
+        return weight.view(structure.shape)
+
+    def restructure(self, structure: Structure, values: th.Tensor) -> None:
+        """Replace connections and values. Their gradient, if there is one, is dropped.
+
+        :param values: shape ``(structure.nnz,)``
+        """
+        self.structure = structure
+        self.snapshot = None
+        replace_data(self.weight, values)
+
+    def await_copy(self, structure: Structure) -> None:
+        """Of a hard target: compute with what is there until the online weights are copied.
+
+        :param structure: connections of the online layer from now on
+        """
+        current, values = self.live()
+        self.snapshot = (current, values.detach().clone())
+        self.structure = structure
+        replace_data(self.weight, th.full((structure.nnz,), AWAITING))
+
+    def _take(self, dense: th.Tensor) -> None:
+        """Take dense weights; a target's that lie outside the structure make a snapshot."""
+        flat = dense.detach().reshape(-1)
+        values = flat[th.from_numpy(self.structure.flat)]
+        if self.is_target:
+            own = Structure.of_mask(flat.numpy() != 0, self.structure.shape)
+            if (own.places_in(self.structure) < 0).any():
+                replace_data(self.weight, th.full((self.structure.nnz,), AWAITING))
+                self.snapshot = (own, flat[th.from_numpy(own.flat)])
+                return
+        self.restructure(self.structure, values)
+
+    def _save_to_state_dict(self, destination: Any, prefix: str, keep_vars: bool) -> None:
+        super()._save_to_state_dict(destination, prefix, keep_vars)
+        destination[prefix + "weight"] = self.dense()
+        if not self.is_target:
+            mask = th.from_numpy(self.structure.mask()).view(self.structure.shape)
+            destination[prefix + MASK_KEY] = mask
+
+    def _load_from_state_dict(
+        self, state_dict: Any, prefix: str, local_metadata: Any, strict: bool,
+        missing_keys: Any, unexpected_keys: Any, error_msgs: Any,
+    ) -> None:  # fmt: skip
+        weight = state_dict.get(prefix + "weight")
+        mask = state_dict.pop(prefix + MASK_KEY, None)
+        for name, tensor in (("weight", weight), (MASK_KEY, mask)):
+            if tensor is not None and tuple(tensor.shape) != self.structure.shape:
+                error_msgs.append(
+                    f"size mismatch for {prefix}{name}: copying a param with shape "
+                    f"{tuple(tensor.shape)} from checkpoint, the shape in current model is "
+                    f"{self.structure.shape}."
+                )
+                return
+        if mask is not None and not self.is_target:
+            if not bool(mask.any()):
+                raise CorruptStateError(f"the mask of {prefix}weight has no connection")
+            self.structure = Structure.of_mask(mask.cpu().numpy(), self.structure.shape)
+            if weight is None:
+                self.restructure(self.structure, th.zeros(self.structure.nnz))
+        if weight is not None:
+            self._take(weight.to(device="cpu", dtype=th.float32))
+            state_dict[prefix + "weight"] = self.weight.detach().clone()
+        super()._load_from_state_dict(
+            state_dict, prefix, local_metadata, strict, missing_keys, unexpected_keys, error_msgs
+        )
+
+
+def replace_data(parameter: nn.Parameter, data: th.Tensor) -> None:
+    """Give a Parameter other data, perhaps of another size; it stays the same object."""
+    if parameter.shape == data.shape:
+        with th.no_grad():
+            parameter.copy_(data)
+        return
+    # While a graph of earlier passes is alive, autograd goes on to expect gradients of the old
+    # size. A change of type makes it forget.
+    parameter.grad = None
+    parameter.data = th.empty(0, dtype=th.float64)
+    parameter.data = data

@@ -1,0 +1,168 @@
+"""The first storage: the dense weight, 0 where inactive, and a mask."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import torch as th
+from numpy.typing import NDArray
+from torch import nn
+
+from sb3_sparse.engine.gradients import (
+    AccumulatedGradient,
+    FunctionalGradient,
+    GradientMask,
+    follow_mask,
+)
+from sb3_sparse.engine.kernels import Kernel
+from sb3_sparse.engine.layers import SparseLayer, moments_of
+from sb3_sparse.engine.linear import MASK_KEY
+from sb3_sparse.topology import Exchange
+
+FLOAT_MASK_KEY = "weight_mask_float"
+
+
+def _ignore_mask_key(
+    module: nn.Module, state_dict: dict[str, Any], prefix: str, *_: object
+) -> None:
+    """Pre-load hook of a target layer, which has no mask of its own."""
+    state_dict.pop(prefix + MASK_KEY, None)
+
+
+class MaskedLayer(SparseLayer):
+    """A layer stored as its dense weight, 0 where inactive, and a boolean mask.
+
+    The mask is the buffer ``weight_mask`` of the module and so rides in its state_dict; a float
+    copy that does not is what gradients are multiplied with. Whenever a state_dict is loaded, at
+    any level, the weight is masked again.
+
+    :param name: dotted name within the policy
+    :param module: the Linear or Conv layer; it stays in place
+    """
+
+    def __init__(self, name: str, module: Kernel) -> None:
+        super().__init__(name, module, tuple(module.weight.shape))
+        self._targets: list[Kernel] = []
+        ones = th.ones_like(module.weight, requires_grad=False)
+        module.register_buffer(MASK_KEY, ones.bool())
+        module.register_buffer(FLOAT_MASK_KEY, ones, persistent=False)
+        hook = module.register_load_state_dict_post_hook(self._after_load)  # type: ignore[no-untyped-call]
+        self._hooks: list[Any] = [hook]
+
+    @property
+    def targets(self) -> Sequence[Kernel]:
+        return self._targets
+
+    @property
+    def compact(self) -> bool:
+        return False
+
+    @property
+    def float_mask(self) -> th.Tensor:
+        """1.0 where active, else 0.0, in the weight's shape and on its device."""
+        # Not through attribute lookup of nn.Module: this is read for every gradient.
+        mask = self.module._buffers[FLOAT_MASK_KEY]
+        assert mask is not None
+        return mask
+
+    def mask(self) -> NDArray[np.bool_]:
+        mask = self.module.get_buffer(MASK_KEY)
+        return np.array(mask.cpu().numpy().ravel(), dtype=np.bool_)
+
+    def dense(self) -> NDArray[np.float32]:
+        array: NDArray[np.float32] = self.weight.detach().cpu().numpy().ravel()
+        return array
+
+    def add_target(self, module: Kernel) -> None:
+        """Make ``module`` a target copy of this layer; it takes the weights that the layer has."""
+        self._targets.append(module)
+        hook = module.register_load_state_dict_pre_hook(_ignore_mask_key)  # type: ignore[no-untyped-call]
+        self._hooks.append(hook)
+        self.sync_targets()
+
+    def sync_targets(self) -> None:
+        """Copy the weights into every target."""
+        with th.no_grad():
+            for target in self.targets:
+                target.weight.copy_(self.weight)
+
+    def mask_targets(self) -> None:
+        with th.no_grad():
+            for target in self.targets:
+                target.weight.mul_(self.float_mask)
+
+    def set_mask(self, mask: NDArray[np.bool_]) -> None:
+        """Replace the mask and set what it has inactive to 0.
+
+        :param mask: shape ``(size,)`` or the weight's shape
+        """
+        buffer = self.module.get_buffer(MASK_KEY)
+        buffer.copy_(th.from_numpy(np.ascontiguousarray(mask)).view(self.shape))
+        self.apply_mask()
+
+    def set_weights(self, weights: NDArray[np.float32]) -> None:
+        """Replace the active weights; what is inactive stays 0.
+
+        :param weights: shape ``(size,)`` or the weight's shape
+        """
+        with th.no_grad():
+            self.weight.copy_(th.from_numpy(np.ascontiguousarray(weights)).view(self.shape))
+        self.apply_mask()
+
+    def apply_mask(self) -> None:
+        """Bring float mask, nnz and weight in line with the boolean mask."""
+        mask = self.module.get_buffer(MASK_KEY)
+        self.float_mask.copy_(mask)
+        self.nnz = int(mask.sum())
+        with th.no_grad():
+            self.weight.mul_(self.float_mask)
+
+    def remask(self) -> None:
+        if not self.full:
+            with th.no_grad():
+                self.weight.mul_(self.float_mask)
+
+    def gradient_mask(self, functional: bool, capturing: Callable[[], bool]) -> GradientMask:
+        return (FunctionalGradient if functional else AccumulatedGradient)(self, capturing)
+
+    def settle_moments(self, optimizers: Sequence[th.optim.Optimizer]) -> None:
+        for state, key, value in moments_of(optimizers, self.weight):
+            if value.shape == self.weight.shape:
+                value.mul_(self.float_mask)
+            elif value.shape == (self.nnz,):  # saved by hand from a compact layer
+                state[key] = th.zeros_like(self.weight)
+                state[key][self.module.get_buffer(MASK_KEY)] = value
+        self.moments_stale = False
+
+    def saved_moment(self, moment: th.Tensor) -> th.Tensor:
+        return moment
+
+    def _move(
+        self,
+        exchange: Exchange,
+        mask: NDArray[np.bool_],
+        optimizers: Sequence[th.optim.Optimizer],
+        soft_targets: bool,
+        dense_grad: th.Tensor | None,
+    ) -> None:
+        before = self.float_mask.clone()
+        self.set_mask(mask)
+        kept = before * self.float_mask
+        for _, _, value in moments_of(optimizers, self.weight):
+            if value.shape == self.weight.shape:
+                value.mul_(kept)
+        if soft_targets:
+            self.mask_targets()
+        follow_mask(self.weight.grad, dense_grad, before, self.float_mask)
+
+    def release(self) -> None:
+        """Take hooks and masks off the modules, for another storage to take over."""
+        for hook in self._hooks:
+            hook.remove()
+        del self.module._buffers[MASK_KEY], self.module._buffers[FLOAT_MASK_KEY]
+
+    def _after_load(self, module: nn.Module, incompatible_keys: object) -> None:
+        self.apply_mask()
+        self.moments_stale = True

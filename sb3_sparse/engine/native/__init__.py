@@ -1,0 +1,1 @@
+"""The compiled kernels: C sources, and the one module that calls them."""

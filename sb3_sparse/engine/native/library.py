@@ -1,0 +1,108 @@
+"""Loads the compiled kernels; the only module that knows they are C."""
+
+from __future__ import annotations
+
+import ctypes
+from functools import cache
+from pathlib import Path
+
+from sb3_sparse.errors import ConfigError, MissingKernels
+
+PATH = Path(__file__).with_name("kernels.so")
+VERSION = 1
+"""Of what the two sides hand each other; ``dispatch.c`` has the same."""
+
+
+class BatchArgument(ctypes.Structure):
+    """``batch_t`` of ``kernels.h``."""
+
+    _fields_ = [
+        (name, ctypes.c_int64)
+        for name in (
+            "layers",
+            "batch",
+            "threads",
+            "input",
+            "rows_in",
+            "rows_out",
+            "rows_grad",
+            "tiles_grad",
+            "rows_input_grad",
+            "tiles_input_grad",
+        )
+    ]
+
+
+@cache
+def library() -> ctypes.CDLL:
+    """The library, set to the best instruction set of this processor.
+
+    :raises MissingKernels: if it was not compiled, or for another version of this package
+    """
+    if ctypes.sizeof(ctypes.c_void_p) != 8:
+        raise MissingKernels("this is a 32-bit Python")
+    if not PATH.exists():
+        raise MissingKernels("there was no C compiler when sb3-sparse was installed")
+    try:
+        found = ctypes.CDLL(str(PATH))
+        version = found.sb3_sparse_version()
+    except (OSError, AttributeError) as error:
+        raise MissingKernels(f"the library does not load ({error})") from error
+    if version != VERSION:
+        raise MissingKernels(f"the library has version {version}, this package {VERSION}")
+    found.sb3_sparse_instructions.restype = ctypes.c_char_p
+    found.sb3_sparse_single.argtypes = [
+        ctypes.c_void_p,
+        ctypes.c_int64,
+        ctypes.c_void_p,
+        ctypes.c_void_p,
+        ctypes.c_void_p,
+    ]
+    _use(found, found.sb3_sparse_instructions(0).decode())
+    return found
+
+
+def why_missing() -> str | None:
+    """What keeps the kernels from running here; None if nothing does."""
+    try:
+        library()
+    except MissingKernels as error:
+        return str(error)
+    return None
+
+
+def instruction_sets() -> list[str]:
+    """The instruction sets that run here, the best first."""
+    found = library()
+    names: list[str] = []
+    while (name := found.sb3_sparse_instructions(len(names))) is not None:
+        names.append(name.decode())
+    return names
+
+
+_in_use = ""
+
+
+def in_use() -> str:
+    """The instruction set that the kernels use."""
+    library()
+    return _in_use
+
+
+def use(name: str) -> None:
+    """Choose another instruction set, for tests and comparisons.
+
+    :raises ConfigError: if it does not run here
+    """
+    if name not in instruction_sets():
+        raise ConfigError(
+            f"{name!r} does not run on this processor; these do: {', '.join(instruction_sets())}"
+        )
+    _use(library(), name)
+
+
+def _use(found: ctypes.CDLL, name: str) -> None:
+    global _in_use
+    done = found.sb3_sparse_use(name.encode())
+    assert done == 0
+    _in_use = name

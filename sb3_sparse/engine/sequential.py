@@ -1,0 +1,101 @@
+"""A ``Sequential`` that runs its compact layers as chains."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch as th
+from torch import nn
+
+from sb3_sparse.engine.chains import Chain
+from sb3_sparse.engine.linear import CompactLinear
+
+ELEMENTWISE = (
+    nn.ReLU,
+    nn.Tanh,
+    nn.Sigmoid,
+    nn.ELU,
+    nn.CELU,
+    nn.SELU,
+    nn.GELU,
+    nn.SiLU,
+    nn.Mish,
+    nn.Softplus,
+    nn.LeakyReLU,
+    nn.ReLU6,
+    nn.Hardtanh,
+    nn.Hardswish,
+    nn.Identity,
+)
+"""Activations that may work on tiles as they are."""
+HOOKS = ("_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_pre_hooks")
+
+
+class ChainedSequential(nn.Sequential):
+    """A ``Sequential`` that runs its compact layers as chains.
+
+    Whoever hooks one of its modules gets the modules called one by one, as in torch.
+    """
+
+    _seen: tuple[nn.Module, ...]
+    _steps: list[tuple[Any, bool, bool]]
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_seen": (), "_steps": []}
+
+    def forward(self, input: th.Tensor) -> th.Tensor:
+        """As of ``Sequential``."""
+        modules = tuple(self._modules.values())
+        if any(getattr(module, hooks) for module in modules for hooks in HOOKS):
+            y: th.Tensor = super().forward(input)  # type: ignore[no-untyped-call]
+            return y
+        if modules != self._seen:
+            self._seen, self._steps = modules, _steps(modules)
+        x, batch, lead = input, 0, input.shape[:-1]
+        for step, tiled_in, tiled_out in self._steps:
+            if not isinstance(step, Chain):
+                x = step(x)
+                continue
+            if not tiled_in:
+                x, batch, lead = step.flattened(x)
+            x = step.run(x, batch, tiled_in, tiled_out)
+            if not tiled_out:
+                x = x.view(*lead, step.rows)
+        return x
+
+
+def _steps(modules: Sequence[Any]) -> list[tuple[Any, bool, bool]]:
+    """Chains and single modules, and whether a chain's input and output are in tiles."""
+    groups: list[Any] = []
+    for module in modules:
+        last = groups[-1] if groups else None
+        if isinstance(module, CompactLinear):
+            if isinstance(last, list):
+                last.append((module, False))
+            else:
+                groups.append([(module, False)])
+        elif type(module) is nn.ReLU and isinstance(last, list) and not last[-1][1]:
+            last[-1] = (last[-1][0], True)
+        else:
+            groups.append(module)
+    found: list[tuple[Any, bool, bool]] = []
+    tiled = False
+    for i, group in enumerate(groups):
+        if not isinstance(group, list):
+            tiled = tiled and type(group) in ELEMENTWISE
+            found.append((group, False, False))
+            continue
+        after = next((g for g in groups[i + 1 :] if type(g) not in ELEMENTWISE), None)
+        chain = Chain([module for module, _ in group], [relu for _, relu in group])
+        found.append((chain, tiled, isinstance(after, list)))
+        tiled = isinstance(after, list)
+    return found
+
+
+def chain_up(root: nn.Module) -> None:
+    """Let every ``Sequential`` below ``root`` run its compact layers as chains."""
+    for module in root.modules():
+        if type(module) is nn.Sequential and any(isinstance(m, CompactLinear) for m in module):
+            module.__class__ = ChainedSequential
+            vars(module).update(_seen=(), _steps=[])
