@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Container, Iterable
 from functools import partial
 from typing import Any
 
 import torch as th
+from torch import nn
 from torch.utils.hooks import RemovableHandle
 
+from sb3_sparse.engine.compact import compacted
 from sb3_sparse.engine.gradients import GradientMask
 from sb3_sparse.engine.layers import SparseLayer
 from sb3_sparse.engine.network import SparseNetwork
 from sb3_sparse.engine.optimizers import add_weight_decay, keep_implementation
 from sb3_sparse.engine.plan import Plan
+from sb3_sparse.engine.sequential import chain_up
 
 
 class Controller:
@@ -103,6 +106,21 @@ class Controller:
                 optimizer.register_state_dict_post_hook(self._saved_form),
             ]
         self._hooked = list(hooked)
+
+    def compact(self, root: nn.Module, names: Container[str] | None = None) -> None:
+        """Store linear layers as their active connections from now on; they stay in place.
+
+        :param root: the policy, whose ``Sequential`` modules shall run them as chains
+        :param names: which; None: all
+        """
+        for network in self.networks:
+            network.layers = [
+                compacted(layer, self.optimizers) if names is None or layer.name in names else layer
+                for layer in network.layers
+            ]
+        chain_up(root)
+        self._hooked = []
+        self.attach()
 
     def begin_training(self) -> None:
         """Called at the start of each round of gradient steps: hooks in place, nothing outdated."""

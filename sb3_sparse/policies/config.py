@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from sb3_sparse.engine.native.library import library
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.sparsity.budgets import split_sparsity
 from sb3_sparse.sparsity.distributions import check_distribution, check_sparsity
 
+COMPUTE = ("masked", "sparse", "auto")
 SPARSITY_MISSING = (
     "a sparse policy needs its sparsity, e.g. policy_kwargs=dict(sparsity=0.9): the removed "
     "fraction of connections, in [0, 1). There is no default, so that a lost value cannot train "
@@ -32,7 +34,10 @@ class SparsityConfig:
         dense keeps SB3's own)
     :param mask_seed: seed of masks and growth; None: read off torch's generator without advancing
         it, so that SB3's ``seed`` decides
+    :param compute: ``"masked"``: dense weights and masks; ``"sparse"``: linear layers store and
+        compute their active connections only; ``"auto"``: whichever is quicker, layer by layer
     :raises ConfigError: for a value that is not allowed
+    :raises MissingKernels: for ``compute="sparse"`` without compiled kernels
     """
 
     sparsity: float | Mapping[str, float] | None
@@ -42,6 +47,7 @@ class SparsityConfig:
     dense_layers: Sequence[str] = ()
     sparsity_aware_init: bool = True
     mask_seed: int | None = None
+    compute: str = "auto"
 
     def __post_init__(self) -> None:
         if self.sparsity is None:
@@ -73,6 +79,13 @@ class SparsityConfig:
             raise ConfigError(
                 f"mask_seed must be a whole number, 0 or more, got {self.mask_seed!r}"
             )
+
+        if self.compute not in COMPUTE:
+            raise ConfigError(
+                f"compute must be one of {', '.join(map(repr, COMPUTE))}, got {self.compute!r}"
+            )
+        if self.compute == "sparse":
+            library()
 
     def by_network(self, sizes: Mapping[str, int]) -> dict[str, float]:
         """The sparsity of each network.

@@ -2,25 +2,41 @@
 
 from __future__ import annotations
 
-from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, NatureCNN
+from stable_baselines3.common.torch_layers import (
+    BaseFeaturesExtractor,
+    CombinedExtractor,
+    FlattenExtractor,
+    NatureCNN,
+)
 
 from sb3_sparse.errors import MissingExtra
+from sb3_sparse.policies.critics import PassesGradientsOn
 from sb3_sparse.policies.mixin import SparsePolicyMixin, with_extractor
 from sb3_sparse.policies.sac import GAUSSIAN_ACTOR, TWIN_CRITIC
 from sb3_sparse.policies.spec import NetworkSpec
 
 try:
-    from sb3_contrib.crossq.policies import CrossQPolicy
+    from sb3_contrib.crossq.policies import CrossQCritic, CrossQPolicy
     from sb3_contrib.qrdqn.policies import QRDQNPolicy
-    from sb3_contrib.tqc.policies import TQCPolicy
+    from sb3_contrib.tqc.policies import Critic, TQCPolicy
 except ImportError as error:
     raise MissingExtra("a sparse policy of TQC, QRDQN, CrossQ or TRPO", "contrib") from error
+
+
+class SparseTQCCritic(PassesGradientsOn, Critic):
+    """Quantile critic of TQC."""
 
 
 class SparseTQCPolicy(SparsePolicyMixin, TQCPolicy):
     """Sparse actor and quantile critics for TQC."""
 
     networks = {"actor": GAUSSIAN_ACTOR, "critic": TWIN_CRITIC}
+
+    def make_critic(
+        self, features_extractor: BaseFeaturesExtractor | None = None
+    ) -> SparseTQCCritic:
+        kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
+        return SparseTQCCritic(**kwargs).to(self.device)
 
 
 SparseTQCMlpPolicy = with_extractor(SparseTQCPolicy, "Mlp", FlattenExtractor)
@@ -46,6 +62,10 @@ SparseQRDQNCnnPolicy = with_extractor(SparseQRDQNPolicy, "Cnn", NatureCNN)
 SparseQRDQNMultiInputPolicy = with_extractor(SparseQRDQNPolicy, "MultiInput", CombinedExtractor)
 
 
+class SparseCrossQCritic(PassesGradientsOn, CrossQCritic):
+    """Critic of CrossQ."""
+
+
 class SparseCrossQPolicy(SparsePolicyMixin, CrossQPolicy):
     """Sparse actor and critics for CrossQ, which has no target network."""
 
@@ -55,6 +75,12 @@ class SparseCrossQPolicy(SparsePolicyMixin, CrossQPolicy):
             roots=("critic",), trunks=("critic.qf*",), heads=("critic.qf*",), owner="critic"
         ),
     }
+
+    def make_critic(
+        self, features_extractor: BaseFeaturesExtractor | None = None
+    ) -> SparseCrossQCritic:
+        kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
+        return SparseCrossQCritic(**kwargs).to(self.device)
 
 
 SparseCrossQMlpPolicy = with_extractor(SparseCrossQPolicy, "Mlp", FlattenExtractor)

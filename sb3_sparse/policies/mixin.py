@@ -44,10 +44,13 @@ class SparsePolicyMixin(BasePolicy):
     :param weight_decay: coupled L2 on kernels only
     :param mask_seed: seed of masks and growth; None: read off torch's generator without advancing
         it, so that SB3's ``seed`` decides
+    :param compute: ``"masked"``: dense weights and masks; ``"sparse"``: linear layers store and
+        compute their active connections only; ``"auto"``: whichever is quicker, layer by layer
     :param kwargs: SB3's own policy arguments; ``features_extractor_class``, ``optimizer_class`` and
         ``activation_fn`` may also be dotted paths, e.g. ``"torch.nn.ReLU"``
     :raises ConfigError: for a value that is not allowed
     :raises UnsupportedError: for layers or observations that cannot be trained sparsely
+    :raises MissingKernels: for ``compute="sparse"`` without compiled kernels
 
     Source: arXiv:2206.10369.
     """
@@ -73,6 +76,7 @@ class SparsePolicyMixin(BasePolicy):
         sparsity_aware_init: bool = True,
         weight_decay: float = 0.0,
         mask_seed: int | None = None,
+        compute: str = "auto",
         **kwargs: Any,
     ) -> None:
         config = SparsityConfig(
@@ -83,6 +87,7 @@ class SparsePolicyMixin(BasePolicy):
             dense_layers=dense_layers,
             sparsity_aware_init=sparsity_aware_init,
             mask_seed=mask_seed,
+            compute=compute,
         )
         import_named(kwargs)
         weight_decay = check_weight_decay(weight_decay, kwargs.get("optimizer_kwargs"))
@@ -98,6 +103,8 @@ class SparsePolicyMixin(BasePolicy):
         for network in {id(network.owner): network for network in networks}.values():
             network.optimizer = rebuild(network.optimizer, self.optimizer_kwargs)
         self.sparse = Controller(networks, seed, self.functional_gradients, weight_decay)
+        if compute == "sparse":
+            self.sparse.compact(self)
         self.sparse.attach()
 
     def __deepcopy__(self: Sparse, memo: dict[int, Any]) -> Sparse:
@@ -195,6 +202,7 @@ class SparsePolicyMixin(BasePolicy):
             dense_layers=list(config.dense_layers),
             sparsity_aware_init=config.sparsity_aware_init,
             mask_seed=config.mask_seed,
+            compute=config.compute,
             weight_decay=self.sparse.weight_decay,
         )
         if hasattr(self, "share_features_extractor"):  # SB3 forgets it for some of its policies

@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
-from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, NatureCNN
+from stable_baselines3.common.torch_layers import (
+    BaseFeaturesExtractor,
+    CombinedExtractor,
+    FlattenExtractor,
+    NatureCNN,
+)
 from stable_baselines3.sac.policies import SACPolicy
 
+from sb3_sparse.policies.critics import SparseContinuousCritic
 from sb3_sparse.policies.mixin import SparsePolicyMixin, with_extractor
 from sb3_sparse.policies.spec import NetworkSpec
 
@@ -27,6 +33,12 @@ class SparseSACPolicy(SparsePolicyMixin, SACPolicy):
     """Sparse actor and critics for SAC."""
 
     networks = {"actor": GAUSSIAN_ACTOR, "critic": TWIN_CRITIC}
+
+    def make_critic(
+        self, features_extractor: BaseFeaturesExtractor | None = None
+    ) -> SparseContinuousCritic:
+        kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
+        return SparseContinuousCritic(**kwargs).to(self.device)
 
 
 SparseSACMlpPolicy = with_extractor(SparseSACPolicy, "Mlp", FlattenExtractor)

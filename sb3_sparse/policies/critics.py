@@ -1,0 +1,47 @@
+"""Critics that compute no gradient that nobody uses."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import torch as th
+from stable_baselines3.common.policies import BaseModel, ContinuousCritic
+from torch import nn
+
+
+@contextmanager
+def _frozen(module: nn.Module) -> Iterator[None]:
+    trained = [parameter for parameter in module.parameters() if parameter.requires_grad]
+    for parameter in trained:
+        parameter.requires_grad_(False)
+    try:
+        yield
+    finally:
+        for parameter in trained:
+            parameter.requires_grad_(True)
+
+
+class PassesGradientsOn(BaseModel):
+    """A critic whose own weights get no gradient where its actions have one.
+
+    That is the actor's loss, in every algorithm: SB3 computes the critic's gradients there too and
+    throws them away. The critic's own loss takes its actions from the replay buffer.
+    """
+
+    def forward(self, obs: Any, actions: th.Tensor) -> Any:
+        if not actions.requires_grad:
+            return super().forward(obs, actions)
+        with _frozen(self):
+            return super().forward(obs, actions)
+
+
+class SparseContinuousCritic(PassesGradientsOn, ContinuousCritic):
+    """Critic of SAC, TD3 and DDPG."""
+
+    def q1_forward(self, obs: Any, actions: th.Tensor) -> th.Tensor:
+        if not actions.requires_grad:
+            return super().q1_forward(obs, actions)
+        with _frozen(self):
+            return super().q1_forward(obs, actions)
