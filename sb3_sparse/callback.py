@@ -21,8 +21,10 @@ class SparsityCallback(BaseCallback):
     it masks stay as they are, which is static sparse training.
 
     Logged: ``sparsity/total``, ``sparsity/<network>``, ``sparsity/nnz``, ``sparsity/mask_updates``,
-    ``sparsity/mask_churn`` (share of the active connections that the last update dropped) and
-    ``sparsity/drop_fraction``.
+    ``sparsity/mask_churn`` (share of the active connections that the last update dropped),
+    ``sparsity/drop_fraction`` and ``sparsity/compact_layers`` (how many compute on non-zeros). What
+    ``compute="auto"`` chose and expects to gain is said once, in the log and as
+    ``sparsity/expected_speedup`` of the layers it measured.
 
     :param method: ``"static"``, ``"set"``, ``"rigl"``, ``"prune"`` or a registered one
     :param update_interval: gradient steps of a network's own optimizer between two updates
@@ -53,6 +55,7 @@ class SparsityCallback(BaseCallback):
         verbose: int = 0,
     ) -> None:
         super().__init__(verbose)
+        self._said: object = None
         topology = method_named(method)
         given = {
             "update_interval": update_interval,
@@ -160,3 +163,10 @@ class SparsityCallback(BaseCallback):
         record("sparsity/mask_updates", max(network.mask_updates for network in networks))
         record("sparsity/mask_churn", max(network.churn for network in networks))
         record("sparsity/drop_fraction", self.plan.drop_fraction_at(sparse.progress))
+        record("sparsity/compact_layers", sum(layer.compact for layer in sparse.layers))
+        choice = None if sparse.auto is None else sparse.auto.choice
+        if choice is not None:
+            record("sparsity/expected_speedup", choice.speedup)
+            if choice is not self._said:
+                self.logger.log(str(choice))
+                self._said = choice

@@ -202,7 +202,7 @@ def enjoy(
 def inspect(
     model: Annotated[Path, typer.Argument(help="A model saved by SB3 (.zip).")],
 ) -> None:
-    """Print shape, nnz, density and FLOPs of every layer of a saved sparse model."""
+    """Print the layers of a saved sparse model, and how they are best computed on this machine."""
     console.print(str(inspect_model(model)), soft_wrap=True)
 
 

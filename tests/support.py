@@ -94,6 +94,10 @@ def arguments_of(algorithm: type[BaseAlgorithm]) -> dict[str, object]:
     return dict(OFF_POLICY)
 
 
+storage = {"compute": "auto"}
+"""Policy arguments that say how models of :func:`make` store their layers."""
+
+
 def make(algorithm, env=None, policy="SparsePolicy", policy_kwargs=None, **kwargs) -> BaseAlgorithm:
     """A small seeded model on an environment that suits the algorithm."""
     if isinstance(algorithm, str):
@@ -102,7 +106,7 @@ def make(algorithm, env=None, policy="SparsePolicy", policy_kwargs=None, **kwarg
         env = "CartPole-v1" if algorithm.__name__ in DISCRETE else "Pendulum-v1"
     policy_kwargs = {"net_arch": [24, 24], **(policy_kwargs or {})}
     if policy.startswith("Sparse"):
-        policy_kwargs.setdefault("sparsity", 0.9)
+        policy_kwargs = {"sparsity": 0.9, **storage, **policy_kwargs}
     arguments = {**arguments_of(algorithm), "seed": 0, "device": "cpu", **kwargs}
     return algorithm(policy, env, policy_kwargs=policy_kwargs, **arguments)
 
@@ -111,15 +115,20 @@ def assert_masked(model: BaseAlgorithm) -> None:
     """Nothing inactive differs from 0: weights, targets that follow at once, moments."""
     sparse = model.policy.sparse
     soft = getattr(model, "tau", 1.0) < 1.0
+    saved = model.policy.state_dict()
+    names = {id(module): name for name, module in model.policy.named_modules()}
     for layer in sparse.layers:
-        inactive = ~layer.module.weight_mask
-        assert layer.nnz == int(layer.module.weight_mask.sum())
-        assert not layer.weight[inactive].any(), layer.name
+        inactive = ~layer.mask().reshape(layer.shape)
+        assert layer.nnz == int((~inactive).sum())
+        np.testing.assert_array_equal(saved[f"{layer.name}.weight_mask"], ~inactive)
+        assert not saved[f"{layer.name}.weight"][inactive].any(), layer.name
         for target in layer.targets:
-            assert int((target.weight != 0).sum()) <= max(layer.nnz, layer.initial_nnz)
+            weight = saved[f"{names[id(target)]}.weight"]
+            assert int((weight != 0).sum()) <= max(layer.nnz, layer.initial_nnz)
             if soft:
-                assert not target.weight[inactive].any(), layer.name
+                assert not weight[inactive].any(), layer.name
         for optimizer in sparse.optimizers:
             for key, value in optimizer.state.get(layer.weight, {}).items():
-                if value.shape == layer.weight.shape:
-                    assert not value[inactive].any(), (layer.name, key)
+                if value.shape == layer.weight.shape and value.dim():
+                    moment = layer.saved_moment(value)
+                    assert not moment[inactive].any(), (layer.name, key)

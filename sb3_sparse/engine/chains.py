@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
+from weakref import ref
 
 import torch as th
 from torch.nn import functional
@@ -43,7 +44,9 @@ class Chain:
         self.relus = list(relus)
         self.columns = self.layers[0].in_features
         self.rows = self.layers[-1].out_features
-        self.widest = max(layer.out_features for layer in self.layers)
+        # A graph must not hold the layers: Python's garbage collector does not see through it, and
+        # SB3's action distributions remember the last one.
+        self._references = [ref(layer) for layer in self.layers]
 
     def __call__(self, x: th.Tensor) -> th.Tensor:
         """The layers on ``x`` of shape ``(..., columns)``."""
@@ -72,24 +75,41 @@ class Chain:
             structure, values = layer.live()
             structures.append(structure)
             parameters += [values, layer.bias]
+        how = _Pass(self.relus, structures, self._references, batch, tiled_in, tiled_out)
         if th.is_grad_enabled() and (
             x.requires_grad or any(p is not None and p.requires_grad for p in parameters)
         ):
-            how = (self, structures, batch, tiled_in, tiled_out)
             y: th.Tensor = _Products.apply(how, x, *parameters)  # type: ignore[no-untyped-call]
             return y
         if batch == 1 and not tiled_in and not tiled_out:
-            return self._single(structures, parameters, x)
-        return self._forward(structures, parameters, x, batch, tiled_in, tiled_out)[0]
+            return how.single(x, parameters)
+        return how.forward(x, parameters)[0]
 
-    def _arguments(
-        self, structures: Sequence[Structure], parameters: Sequence[Any], outputs: Sequence[int]
-    ) -> list[int]:
+
+class _Pass(NamedTuple):
+    """One way forth, and perhaps back, of a batch through a chain."""
+
+    relus: list[bool]
+    structures: list[Structure]
+    layers: list[Any]
+    batch: int
+    tiled_in: bool
+    tiled_out: bool
+
+    @property
+    def columns(self) -> int:
+        return self.structures[0].shape[1]
+
+    @property
+    def rows(self) -> int:
+        return self.structures[-1].shape[0]
+
+    def arguments(self, parameters: Sequence[Any], outputs: Sequence[int]) -> list[int]:
         """``layer_t`` of every layer, without the gradients."""
-        arguments = []
-        for i, structure in enumerate(structures):
+        arguments: list[int] = []
+        for i, structure in enumerate(self.structures):
             bias = parameters[2 * i + 1]
-            arguments += [
+            arguments += (
                 *structure.shape,
                 self.relus[i],
                 *structure.addresses,
@@ -99,139 +119,141 @@ class Chain:
                 0,
                 0,
                 0,
-            ]
+            )
         return arguments
 
-    def _single(
-        self, structures: Sequence[Structure], parameters: Sequence[Any], x: th.Tensor
-    ) -> th.Tensor:
+    def single(self, x: th.Tensor, parameters: Sequence[Any]) -> th.Tensor:
+        """One input, row by row; nothing is kept."""
         y = th.empty(1, self.rows)
-        spare = th.empty(2 * self.widest)
-        arguments = self._arguments(structures, parameters, [0] * len(structures))
+        spare = th.empty(2 * max(structure.shape[0] for structure in self.structures))
+        arguments = self.arguments(parameters, [0] * len(self.structures))
         library().sb3_sparse_single(
             (ctypes.c_int64 * len(arguments))(*arguments),
-            len(structures),
+            len(self.structures),
             x.data_ptr(),
             spare.data_ptr(),
             y.data_ptr(),
         )
         return y
 
-    def _forward(
-        self,
-        structures: Sequence[Structure],
-        parameters: Sequence[Any],
-        x: th.Tensor,
-        batch: int,
-        tiled_in: bool,
-        tiled_out: bool,
+    def forward(
+        self, x: th.Tensor, parameters: Sequence[Any]
     ) -> tuple[th.Tensor, th.Tensor, list[int]]:
         """Result, workspace with all activations in tiles (but a tiled result), and arguments."""
-        tiles = tiles_of(batch)
-        kept = 0 if tiled_in else self.columns
-        widths = [structure.shape[0] for structure in structures]
-        y = th.empty((tiles, self.rows, TILE) if tiled_out else (batch, self.rows))
-        work = th.empty(tiles * TILE * (kept + sum(widths[:-1]) + (not tiled_out) * self.rows))
-        start = work.data_ptr()
-        outputs = []
-        at = kept
+        tiles = tiles_of(self.batch)
+        widths = self._widths()
+        y = th.empty((tiles, self.rows, TILE) if self.tiled_out else (self.batch, self.rows))
+        work = th.empty(tiles * TILE * sum(widths))
+        start = at = work.data_ptr()
+        places = []
         for width in widths:
-            outputs.append(start + 4 * tiles * TILE * at)
-            at += width
-        if tiled_out:
-            outputs[-1] = y.data_ptr()
-        arguments = self._arguments(structures, parameters, outputs)
+            places.append(at)
+            at += 4 * tiles * TILE * width
+        outputs = places[0 if self.tiled_in else 1 :]
+        if self.tiled_out:
+            outputs.append(y.data_ptr())
+        arguments = self.arguments(parameters, outputs)
         how = BatchArgument(
-            layers=len(structures),
-            batch=batch,
+            layers=len(self.structures),
+            batch=self.batch,
             threads=th.get_num_threads(),
-            input=x.data_ptr() if tiled_in else start,
-            rows_in=0 if tiled_in else x.data_ptr(),
-            rows_out=0 if tiled_out else y.data_ptr(),
+            input=x.data_ptr() if self.tiled_in else start,
+            rows_in=0 if self.tiled_in else x.data_ptr(),
+            rows_out=0 if self.tiled_out else y.data_ptr(),
         )
         library().sb3_sparse_forward(
             (ctypes.c_int64 * len(arguments))(*arguments), ctypes.byref(how)
         )
         return y, work, arguments
 
-    def _inputs(self, x: th.Tensor, work: th.Tensor, y: th.Tensor, tiled_in: bool) -> list[Any]:
+    def _widths(self) -> list[int]:
+        """Features of what the workspace holds: the input and each output, but what is tiled."""
+        widths = [self.columns, *(structure.shape[0] for structure in self.structures)]
+        return widths[1 if self.tiled_in else 0 : -1 if self.tiled_out else None]
+
+    def inputs(self, x: th.Tensor, work: th.Tensor) -> list[th.Tensor]:
         """Each layer's input in tiles, as the way forth left it."""
-        tiles = x.shape[0] if tiled_in else tiles_of(x.shape[0])
-        at = 0
-        inputs = []
-        if tiled_in:
-            inputs.append(x)
-        for layer in self.layers:
-            if len(inputs) == len(self.layers):
-                break
-            width = layer.in_features if not inputs else 0
-            width = width or self.layers[len(inputs) - 1].out_features
-            size = tiles * TILE * width
-            inputs.append(work[at : at + size].view(tiles, width, TILE))
-            at += size
-        return inputs
+        tiles = tiles_of(self.batch)
+        widths = self._widths()
+        parts = th.split(work, [tiles * TILE * width for width in widths])
+        shaped = [part.view(tiles, width, TILE) for part, width in zip(parts, widths, strict=True)]
+        return ([x, *shaped] if self.tiled_in else shaped)[: len(self.structures)]
+
+    def by_dense_weights(self, x: th.Tensor, parameters: Sequence[Any]) -> th.Tensor:
+        """The same result by dense weights, which torch differentiates as often as one likes."""
+        if self.tiled_in:
+            x = x.transpose(1, 2).reshape(-1, self.columns)[: self.batch]
+        for i, structure in enumerate(self.structures):
+            rows, columns = structure.shape
+            flat = th.from_numpy(structure.flat)
+            weight = th.zeros(rows * columns).index_put((flat,), parameters[2 * i])
+            x = functional.linear(x, weight.view(rows, columns), parameters[2 * i + 1])
+            if self.relus[i]:
+                x = functional.relu(x)
+        if self.tiled_out:
+            x = functional.pad(x, (0, 0, 0, tiles_of(self.batch) * TILE - self.batch))
+            x = x.view(-1, TILE, self.rows).transpose(1, 2)
+        return x
 
 
 class _Products(th.autograd.Function):
     """A chain on a batch, differentiable by its input, values and biases."""
 
     @staticmethod
-    def forward(ctx: Any, how: Any, x: th.Tensor, *parameters: Any) -> th.Tensor:
-        chain, structures, batch, tiled_in, tiled_out = how
-        y: th.Tensor
-        y, work, arguments = chain._forward(structures, parameters, x, batch, tiled_in, tiled_out)
+    def forward(ctx: Any, how: _Pass, x: th.Tensor, *parameters: Any) -> th.Tensor:
+        y, work, arguments = how.forward(x, parameters)
         ctx.how, ctx.arguments = how, arguments
-        # A tiled result is part of what the way back needs; as an output it may be saved.
-        ctx.save_for_backward(x, work, y if tiled_out else None, *parameters)
+        # What is tiled goes into the way back, so it is kept as well.
+        ctx.save_for_backward(x, work, y if how.tiled_out else None, *parameters)
         return y
 
     @staticmethod
     def backward(ctx: Any, *gradients: Any) -> Any:
-        (grad,) = gradients
-        chain, structures, batch, tiled_in, tiled_out = ctx.how
-        x, work, y, *parameters = ctx.saved_tensors
+        how: _Pass = ctx.how
+        x, work, _, *parameters = ctx.saved_tensors
         needs_x, *needs = ctx.needs_input_grad[1:]
-        if th.is_grad_enabled():  # the gradient shall itself be differentiable
-            wanted = [
-                p for p, need in zip((x, *parameters), (needs_x, *needs), strict=True) if need
-            ]
-            result = _by_dense_weights(chain, structures, batch, tiled_in, tiled_out, x, parameters)
-            found = iter(th.autograd.grad(result, wanted, grad, create_graph=True))
-            return None, *(next(found) if need else None for need in (needs_x, *needs))
-        grad = grad.contiguous()
+        if th.is_grad_enabled():  # the gradient shall itself be differentiable; TRPO asks for it
+            pairs = list(zip((x, *parameters), (needs_x, *needs), strict=True))
+            result = how.by_dense_weights(x, parameters)
+            wanted = [tensor for tensor, need in pairs if need]
+            found = iter(th.autograd.grad(result, wanted, gradients, create_graph=True))
+            return None, *(next(found) if need else None for _, need in pairs)
+        grad = gradients[0].contiguous()
         arguments = list(ctx.arguments)
         grads: list[th.Tensor | None] = []
         for i, (parameter, need) in enumerate(zip(parameters, needs, strict=True)):
-            grads.append(th.empty_like(parameter) if need else None)
-            if need:
+            made = th.empty_like(parameter) if need else None
+            grads.append(made)
+            if made is not None:
                 field = BIAS_GRAD if i % 2 else VALUE_GRAD
-                arguments[FIELDS * (i // 2) + field] = grads[i].data_ptr()  # type: ignore[union-attr]
-        listening: dict[int, th.Tensor] = {}
-        for i, layer in enumerate(chain.layers):
-            if needs[2 * i] and layer.listener is not None and layer.listener.wanted():
-                listening[i] = th.empty(tiles_of(batch), layer.out_features, TILE)
-                arguments[FIELDS * i + OUTPUT_GRAD] = listening[i].data_ptr()
+                arguments[FIELDS * (i // 2) + field] = made.data_ptr()
+        listening: list[tuple[int, Any, th.Tensor]] = []
+        for i, reference in enumerate(how.layers):
+            listener = None if (layer := reference()) is None else layer.listener
+            if needs[2 * i] and listener is not None and listener.wanted():
+                left = th.empty(tiles_of(how.batch), how.structures[i].shape[0], TILE)
+                arguments[FIELDS * i + OUTPUT_GRAD] = left.data_ptr()
+                listening.append((i, listener, left))
         grad_x = th.empty_like(x) if needs_x else None
         to = 0 if grad_x is None else grad_x.data_ptr()
-        how = BatchArgument(
-            layers=len(structures),
-            batch=batch,
+        argument = BatchArgument(
+            layers=len(how.structures),
+            batch=how.batch,
             threads=th.get_num_threads(),
-            input=x.data_ptr() if tiled_in else work.data_ptr(),
-            rows_grad=0 if tiled_out else grad.data_ptr(),
-            tiles_grad=grad.data_ptr() if tiled_out else 0,
-            rows_input_grad=0 if tiled_in else to,
-            tiles_input_grad=to if tiled_in else 0,
+            input=x.data_ptr() if how.tiled_in else work.data_ptr(),
+            rows_grad=0 if how.tiled_out else grad.data_ptr(),
+            tiles_grad=grad.data_ptr() if how.tiled_out else 0,
+            rows_input_grad=0 if how.tiled_in else to,
+            tiles_input_grad=to if how.tiled_in else 0,
         )
         failed = library().sb3_sparse_backward(
-            (ctypes.c_int64 * len(arguments))(*arguments), ctypes.byref(how)
+            (ctypes.c_int64 * len(arguments))(*arguments), ctypes.byref(argument)
         )
         if failed:
             raise MemoryError("no memory for the gradient of a chain of compact layers")
-        if listening:
-            inputs = chain._inputs(x, work, y, tiled_in)
-            for i, output_grad in listening.items():
-                chain.layers[i].listener.note(_outer(output_grad, inputs[i], batch))
+        inputs = how.inputs(x, work) if listening else []
+        for i, listener, left in listening:
+            listener.note(_outer(left, inputs[i], how.batch))
         return None, grad_x, *grads
 
 
@@ -242,31 +264,3 @@ def _outer(output_grad: th.Tensor, x: th.Tensor, batch: int) -> th.Tensor:
         entries = min(TILE, batch - t * TILE)
         total.addmm_(output_grad[t, :, :entries], x[t, :, :entries].T)
     return total
-
-
-def _by_dense_weights(
-    chain: Chain,
-    structures: Sequence[Structure],
-    batch: int,
-    tiled_in: bool,
-    tiled_out: bool,
-    x: th.Tensor,
-    parameters: Sequence[Any],
-) -> th.Tensor:
-    """The same result by dense weights, which torch differentiates as often as one likes.
-
-    Only TRPO asks for it.
-    """
-    if tiled_in:
-        x = x.transpose(1, 2).reshape(-1, chain.columns)[:batch]
-    for i, structure in enumerate(structures):
-        rows, columns = structure.shape
-        flat = th.from_numpy(structure.flat)
-        weight = th.zeros(rows * columns).index_put((flat,), parameters[2 * i])
-        x = functional.linear(x, weight.view(rows, columns), parameters[2 * i + 1])
-        if chain.relus[i]:
-            x = functional.relu(x)
-    if tiled_out:
-        x = functional.pad(x, (0, 0, 0, tiles_of(batch) * TILE - batch))
-        x = x.view(-1, TILE, chain.rows).transpose(1, 2)
-    return x

@@ -10,6 +10,7 @@ import torch as th
 from torch import nn
 from torch.utils.hooks import RemovableHandle
 
+from sb3_sparse.engine.auto import AutoCompute
 from sb3_sparse.engine.compact import compacted
 from sb3_sparse.engine.gradients import GradientMask
 from sb3_sparse.engine.layers import SparseLayer
@@ -33,6 +34,7 @@ class Controller:
     :param functional_gradients: whether the algorithm may take gradients with
         ``torch.autograd.grad`` (see :mod:`sb3_sparse.engine.gradients`)
     :param weight_decay: coupled L2 coefficient, added to the gradient of every kernel
+    :param auto: chooses the storage of layers; None leaves it as it is
     """
 
     def __init__(
@@ -41,11 +43,13 @@ class Controller:
         seed: int,
         functional_gradients: bool,
         weight_decay: float = 0.0,
+        auto: AutoCompute | None = None,
     ) -> None:
         self.networks = networks
         self.seed = seed
         self.weight_decay = weight_decay
         self.functional_gradients = functional_gradients
+        self.auto = auto
         self.plan: Plan | None = None
         self._in_force: Callable[[], bool] = bool
         self.progress = 0.0
@@ -122,9 +126,18 @@ class Controller:
         self._hooked = []
         self.attach()
 
-    def begin_training(self) -> None:
-        """Called at the start of each round of gradient steps: hooks in place, nothing outdated."""
+    def begin_training(self, root: nn.Module) -> None:
+        """Called at the start of each round of gradient steps: hooks in place, nothing outdated.
+
+        :param root: the policy
+        """
         self.attach()
+        if self.auto is not None:
+            layers = list(self.layers)
+            self.auto.watch(root, layers)
+            choice = self.auto.choose(root, layers)
+            if choice is not None and choice.compact:
+                self.compact(root, choice.compact)
         if self.plan is not None and not self._in_force():
             self.plan = None  # of a training that was interrupted
         for mask in self._gradient_masks.values():

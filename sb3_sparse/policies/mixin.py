@@ -14,6 +14,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import Schedule
 
+from sb3_sparse.engine.auto import AutoCompute
 from sb3_sparse.engine.controller import Controller
 from sb3_sparse.engine.optimizers import check_weight_decay, rebuild
 from sb3_sparse.errors import CorruptStateError
@@ -102,7 +103,8 @@ class SparsePolicyMixin(BasePolicy):
         networks = build_networks(self, self.networks, config, seed, self._initial_gain)
         for network in {id(network.owner): network for network in networks}.values():
             network.optimizer = rebuild(network.optimizer, self.optimizer_kwargs)
-        self.sparse = Controller(networks, seed, self.functional_gradients, weight_decay)
+        auto = AutoCompute() if compute == "auto" else None
+        self.sparse = Controller(networks, seed, self.functional_gradients, weight_decay, auto)
         if compute == "sparse":
             self.sparse.compact(self)
         self.sparse.attach()
@@ -130,7 +132,7 @@ class SparsePolicyMixin(BasePolicy):
         """As in SB3. Every ``train()`` calls it first: here a copied policy gets its hooks back."""
         super().set_training_mode(mode)
         if mode:
-            self.sparse.begin_training()
+            self.sparse.begin_training(self)
 
     def load_from_vector(self, vector: np.ndarray[Any, Any]) -> None:
         """As in SB3; what the masks have inactive stays 0."""
@@ -163,10 +165,14 @@ class SparsePolicyMixin(BasePolicy):
                 )
 
     def get_extra_state(self) -> th.Tensor:
-        """Mask seed, then clock and number of mask updates of each network; int64."""
+        """Mask seed, clock and number of mask updates of each network, minibatch size; int64.
+
+        The last is what ``compute="auto"`` has seen, or 0.
+        """
         numbers = [self.sparse.seed]
         for network in self.sparse.networks:
             numbers += [network.clock, network.mask_updates]
+        numbers.append(0 if self.sparse.auto is None else self.sparse.auto.batch)
         return th.tensor(numbers, dtype=th.int64)
 
     def set_extra_state(self, state: th.Tensor) -> None:
@@ -175,21 +181,23 @@ class SparsePolicyMixin(BasePolicy):
         :raises CorruptStateError: if it is not of this policy
         """
         networks = self.sparse.networks
-        expected = 1 + 2 * len(networks)
+        expected = 2 + 2 * len(networks)
         if (
             not isinstance(state, th.Tensor)
             or state.shape != (expected,)
             or bool((state < 0).any())
         ):
             raise CorruptStateError(
-                f"the saved sparsity state must be {expected} numbers, 0 or more (seed, and clock "
-                f"and updates of {', '.join(n.name for n in networks)}), got {state!r}; the file "
-                "is damaged or belongs to a policy of another kind"
+                f"the saved sparsity state must be {expected} numbers, 0 or more (seed, clock and "
+                f"updates of {', '.join(n.name for n in networks)}, batch), got {state!r}; the "
+                "file is damaged or belongs to a policy of another kind"
             )
-        seed, *numbers = state.tolist()
+        seed, *numbers, batch = state.tolist()
         self.sparse.seed = int(seed)
         for network, clock, updates in zip(networks, numbers[::2], numbers[1::2], strict=True):
             network.clock, network.mask_updates = int(clock), int(updates)
+        if self.sparse.auto is not None and batch:
+            self.sparse.auto.batch = int(batch)  # a resumed run chooses at once
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()

@@ -2,19 +2,47 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
 
 from stable_baselines3.common.save_util import load_from_zip_file
 
+from sb3_sparse.engine.auto import Choice, choose
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.policies.mixin import SparsePolicyMixin
 from sb3_sparse.policies.report import SparsityReport
+from sb3_sparse.zoo.threads import use_few_threads
 
 
-def load_sparse_policy(path: Path) -> SparsePolicyMixin:
-    """The sparse policy in a zip that SB3 saved, whichever algorithm trained it.
+@dataclass(frozen=True)
+class Inspection:
+    """What a saved model is.
+
+    :param report: its layers
+    :param choice: what ``compute="auto"`` would choose on this machine; None if the model was not
+        trained in minibatches of one size
+    :param compute: what it was made with
+    """
+
+    report: SparsityReport
+    choice: Choice | None
+    compute: str
+
+    def __str__(self) -> str:
+        if self.choice is None:
+            return str(self.report)
+        parts = [str(self.report), "", f"On this machine {self.choice}"]
+        if self.choice.layers:
+            parts.append(self.choice.table())
+        if self.compute != "auto":
+            parts.append(f"The model was made with compute={self.compute!r}, so nothing is chosen.")
+        return "\n".join(parts)
+
+
+def _load(path: Path) -> tuple[SparsePolicyMixin, dict[str, Any]]:
+    """The sparse policy in a zip that SB3 saved, whichever algorithm trained it, and its data.
 
     :raises ConfigError: if there is no such file, or no sparse policy in it
     """
@@ -32,7 +60,7 @@ def load_sparse_policy(path: Path) -> SparsePolicyMixin:
         raise ConfigError(f"the policy in {path} is not sparse but {name}")
     assert data is not None
     assert params is not None
-    kwargs = dict(data["policy_kwargs"])
+    kwargs = {**data["policy_kwargs"], "compute": "masked"}  # which every machine can
     if data["use_sde"]:
         kwargs["use_sde"] = True
     policy = policy_class(
@@ -40,9 +68,16 @@ def load_sparse_policy(path: Path) -> SparsePolicyMixin:
     )
     state: Any = params["policy"]
     policy.load_state_dict(state)
-    return policy
+    return policy, data
 
 
-def inspect_model(path: Path) -> SparsityReport:
-    """The sparsity report of a saved model."""
-    return load_sparse_policy(path).sparsity_report()
+def inspect_model(path: Path) -> Inspection:
+    """The sparsity report of a saved model, and how its layers would best be computed here."""
+    policy, data = _load(path)
+    batch = data.get("batch_size")
+    use_few_threads(policy.observation_space)
+    return Inspection(
+        report=policy.sparsity_report(),
+        choice=choose(policy, list(policy.sparse.layers), batch) if batch else None,
+        compute=data["policy_kwargs"].get("compute", "auto"),
+    )

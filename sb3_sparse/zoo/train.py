@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import os
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -16,7 +15,6 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.preprocessing import is_image_space
 
 from sb3_sparse.errors import ConfigError, MissingExtra, SparsityError
 from sb3_sparse.policies.mixin import SparsePolicyMixin
@@ -35,6 +33,7 @@ from sb3_sparse.zoo.record import read_record, sparsity_of, versions, write_reco
 from sb3_sparse.zoo.results import Outcome, final_results
 from sb3_sparse.zoo.run import Run
 from sb3_sparse.zoo.settings import method_of
+from sb3_sparse.zoo.threads import use_few_threads
 
 EVALUATION_ENVS = 10
 
@@ -240,16 +239,6 @@ def check_action_space(run: Run, space: spaces.Space[Any]) -> None:
         raise ConfigError(
             f"{run.algo} cannot act in {run.env_id}, whose actions are {space}; take {others}"
         )
-
-
-def use_few_threads(observation_space: spaces.Space[Any]) -> None:
-    """One thread for networks without convolutions, which more threads only slow down.
-
-    ``OMP_NUM_THREADS`` decides where it is set.
-    """
-    images = isinstance(observation_space, spaces.Dict) or is_image_space(observation_space)
-    if "OMP_NUM_THREADS" not in os.environ and not images:
-        th.set_num_threads(1)
 
 
 def new_run_folder(parent: Path, env_name: str) -> Path:

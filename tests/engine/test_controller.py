@@ -255,13 +255,13 @@ def test_loaded_weights_are_masked_at_once_and_loaded_moments_before_the_next_st
 
 
 def test_a_plan_of_a_training_that_is_over_is_dropped_at_the_next_one():
-    _, _, controller = rig()
+    owner, _, controller = rig()
     going_on = True
     controller.start(controller.plan, soft_targets=True, in_force=lambda: going_on)
-    controller.begin_training()
+    controller.begin_training(owner)
     assert controller.plan is not None
     going_on = False
-    controller.begin_training()
+    controller.begin_training(owner)
     assert controller.plan is None
 
 

@@ -260,12 +260,12 @@ def test_weights_set_from_a_vector_are_masked():
 
 
 @pytest.mark.parametrize(
-    "state", [th.zeros(2, dtype=th.int64), th.tensor([-1, 0, 0, 0, 0]), {"seed": 1}]
+    "state", [th.zeros(2, dtype=th.int64), th.tensor([-1, 0, 0, 0, 0, 0]), {"seed": 1}]
 )
 def test_a_damaged_state_is_refused(state):
     policy = make("SAC").policy
     damaged = dict(policy.state_dict(), _extra_state=state)
-    with pytest.raises(CorruptStateError, match="must be 5 numbers"):
+    with pytest.raises(CorruptStateError, match="must be 6 numbers"):
         policy.load_state_dict(damaged)
 
 

@@ -1,0 +1,258 @@
+"""The kernels against dense, masked autograd."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch as th
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import nn
+from torch.nn import functional
+
+from sb3_sparse.engine.linear import CompactLinear
+from sb3_sparse.engine.native import library
+from sb3_sparse.engine.sequential import ChainedSequential, chain_up
+from sb3_sparse.engine.structure import Structure
+from sb3_sparse.errors import ConfigError, UnsupportedError
+
+TOLERANCE = 1e-5
+
+
+@pytest.fixture(params=library.instruction_sets())
+def instructions(request):
+    before = library.in_use()
+    library.use(request.param)
+    yield request.param
+    library.use(before)
+
+
+@pytest.fixture
+def threads():
+    before = th.get_num_threads()
+    yield th.set_num_threads
+    th.set_num_threads(before)
+
+
+def random_mask(shape, kind: str, random: np.random.Generator) -> np.ndarray:
+    if kind == "full":
+        return np.ones(shape, dtype=bool)
+    mask = random.random(shape) < 0.3
+    if kind == "empty row":
+        mask[random.integers(shape[0])] = False
+    if kind == "full row":
+        mask[random.integers(shape[0])] = True
+    if kind == "empty":
+        mask[:] = False
+    return mask
+
+
+def networks(widths, kinds, activation, bias, seed) -> tuple[nn.Sequential, nn.Sequential]:
+    """The same layers dense under masks, and compact."""
+    random = np.random.default_rng(seed)
+    th.manual_seed(seed)
+    dense, compact = [], []
+    for i, (columns, rows) in enumerate(zip(widths, widths[1:], strict=False)):
+        mask = random_mask((rows, columns), kinds[i % len(kinds)], random)
+        layer, twin = nn.Linear(columns, rows, bias=bias), nn.Linear(columns, rows, bias=bias)
+        with th.no_grad():
+            layer.weight.mul_(th.from_numpy(mask))
+        twin.load_state_dict(layer.state_dict())
+        layer.mask = mask
+        dense += [layer, activation()]
+        compact += [
+            CompactLinear.convert(twin, Structure.of_mask(mask, mask.shape), is_target=False),
+            activation(),
+        ]
+    dense.pop()
+    compact.pop()
+    result = nn.Sequential(*compact)
+    chain_up(result)
+    assert type(result) is ChainedSequential
+    return nn.Sequential(*dense), result
+
+
+def close(ours: th.Tensor, theirs: th.Tensor) -> None:
+    """Equal to 1e-5 of the largest."""
+    scale = max(float(theirs.detach().abs().max()), 1e-3) if theirs.numel() else 1.0
+    assert ours.shape == theirs.shape
+    np.testing.assert_allclose(ours.detach(), theirs.detach(), rtol=0, atol=TOLERANCE * scale)
+
+
+def compare(dense, compact, batch, seed=0) -> None:
+    random = th.Generator().manual_seed(seed)
+    x = th.randn(batch, dense[0].in_features, generator=random)
+    grad = th.randn(batch, dense[-1].out_features, generator=random)
+    ours, theirs = x.clone().requires_grad_(), x.clone().requires_grad_()
+    y = compact(ours)
+    close(y, dense(theirs))
+    with th.no_grad():
+        close(compact(x), y)
+        for row in range(min(3, batch)):
+            close(compact(x[row : row + 1]), y[row : row + 1])
+    y.backward(grad)
+    dense(theirs).backward(grad)
+    close(ours.grad, theirs.grad)
+    for layer, twin in zip(dense, compact, strict=True):
+        if isinstance(layer, nn.Linear):
+            close(twin.weight.grad, layer.weight.grad[th.from_numpy(layer.mask)])
+            if layer.bias is not None:
+                close(twin.bias.grad, layer.bias.grad)
+
+
+KINDS = ["some", "full", "empty row", "full row", "empty"]
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    widths=st.lists(st.integers(1, 70), min_size=2, max_size=5),
+    kinds=st.lists(st.sampled_from(KINDS), min_size=1, max_size=4),
+    activation=st.sampled_from([nn.ReLU, nn.Tanh, nn.Identity, nn.ELU]),
+    batch=st.integers(1, 200),
+    bias=st.booleans(),
+    seed=st.integers(0, 2**20),
+)
+def test_results_and_gradients_are_those_of_dense_masked_layers(
+    widths, kinds, activation, batch, bias, seed
+):
+    compare(*networks(widths, kinds, activation, bias, seed), batch, seed)
+
+
+@pytest.mark.parametrize("batch", [1, 15, 16, 17, 48, 63, 64, 65, 128, 250])
+def test_every_instruction_set_handles_every_batch(instructions, batch):
+    compare(*networks([23, 70, 33, 1], ["some", "full row"], nn.ReLU, True, 3), batch)
+
+
+def test_results_do_not_depend_on_the_number_of_threads(threads):
+    dense, compact = networks([40, 90, 50], ["some"], nn.ReLU, True, 1)
+    x = th.randn(333, 40)
+    found = []
+    for count in (1, 2, 5):
+        threads(count)
+        compact.zero_grad()
+        y = compact(x)
+        y.square().sum().backward()
+        found.append([y.detach(), *(p.grad.clone() for p in compact.parameters())])
+    for several in found[1:]:
+        np.testing.assert_array_equal(several[0], found[0][0])
+        for ours, one in zip(several[1:], found[0][1:], strict=True):
+            close(ours, one)
+
+
+def test_instruction_sets_agree():
+    if len(library.instruction_sets()) == 1:
+        pytest.skip("this processor has one instruction set only")
+    _, compact = networks([40, 90, 50], ["some"], nn.ReLU, True, 1)
+    x = th.randn(100, 40)
+    best = library.in_use()
+    found = []
+    for name in library.instruction_sets():
+        library.use(name)
+        found.append(compact(x).detach())
+    library.use(best)
+    for other in found[1:]:
+        close(other, found[0])
+
+
+def test_an_unknown_instruction_set_is_refused():
+    with pytest.raises(ConfigError, match="these do: .*"):
+        library.use("altivec")
+
+
+def test_leading_dimensions_stay_and_a_single_vector_too():
+    dense, compact = networks([5, 8, 3], ["some"], nn.ReLU, True, 0)
+    for shape in [(5,), (7, 5), (2, 3, 5), (0, 5)]:
+        x = th.randn(shape)
+        close(compact(x), dense(x))
+
+
+def test_a_strided_input_is_taken_as_it_is():
+    dense, compact = networks([5, 8, 3], ["some"], nn.ReLU, True, 0)
+    x = th.randn(9, 10)[:, ::2]
+    close(compact(x), dense(x))
+
+
+@pytest.mark.parametrize("x", [th.zeros(4, 6), th.zeros(4, 5, dtype=th.float64)])
+def test_what_the_kernels_cannot_read_is_refused(x):
+    _, compact = networks([5, 8, 3], ["some"], nn.ReLU, True, 0)
+    with pytest.raises(UnsupportedError, match="takes float32 on the CPU with 5 features"):
+        compact(x)
+
+
+def test_what_is_not_a_number_stays_that():
+    dense, compact = networks([5, 8, 3], ["full"], nn.ReLU, True, 0)
+    x = th.zeros(4, 5)
+    x[2, 1] = float("nan")
+    assert th.isnan(compact(x)[2]).all()
+    assert not th.isnan(compact(x)[[0, 1, 3]]).any()
+    assert th.isnan(dense(x)[2]).all()
+
+
+def test_weights_without_gradient_get_none_and_pass_it_on():
+    dense, compact = networks([5, 8, 3], ["some"], nn.ReLU, True, 0)
+    x = th.randn(7, 5)
+    ours, theirs = x.clone().requires_grad_(), x.clone().requires_grad_()
+    for parameter in compact.parameters():
+        parameter.requires_grad_(False)
+    compact(ours).sum().backward()
+    dense(theirs).sum().backward()
+    close(ours.grad, theirs.grad)
+    assert all(parameter.grad is None for parameter in compact.parameters())
+
+
+def test_second_derivatives_as_trpo_takes_them():
+    dense, compact = networks([5, 8, 3], ["some"], nn.Tanh, True, 0)
+    x = th.randn(70, 5)
+
+    def curvature(network: nn.Module) -> list[th.Tensor]:
+        parameters = list(network.parameters())
+        loss = network(x).square().sum()
+        first = th.autograd.grad(loss, parameters, create_graph=True)
+        return list(th.autograd.grad(sum(g.square().sum() for g in first), parameters))
+
+    masks = [th.from_numpy(layer.mask) for layer in dense if isinstance(layer, nn.Linear)]
+    # Masked weights have no second derivative by what is inactive either.
+    flat = [layer for layer in dense if isinstance(layer, nn.Linear)]
+    for layer, mask in zip(flat, masks, strict=True):
+        layer.weight.register_hook(lambda grad, mask=mask: grad * mask)
+    ours, theirs = curvature(compact), curvature(dense)
+    for i, (mine, other) in enumerate(zip(ours, theirs, strict=True)):
+        close(mine, other if i % 2 else other[masks[i // 2]])
+
+
+def test_a_hooked_module_is_called_by_itself():
+    dense, compact = networks([5, 8, 3], ["some"], nn.ReLU, True, 0)
+    seen = []
+    handle = compact[1].register_forward_hook(lambda module, inputs, y: seen.append(y))
+    x = th.randn(7, 5)
+    close(compact(x), dense(x))
+    close(seen[0], functional.relu(dense[0](x)))
+    handle.remove()
+    compact(x)
+    assert len(seen) == 1
+
+
+def test_a_changed_sequence_is_noticed():
+    dense, compact = networks([5, 8, 3], ["some"], nn.ReLU, True, 0)
+    x = th.randn(7, 5)
+    compact(x)
+    compact.append(nn.Tanh())
+    close(compact(x), th.tanh(dense(x)))
+    compact[1] = nn.Sigmoid()
+    close(compact(x), th.tanh(dense[2](th.sigmoid(dense[0](x)))))
+
+
+def test_modules_that_look_at_whole_rows_get_rows():
+    dense, compact = networks([5, 8, 8, 3], ["some"], nn.ReLU, True, 0)
+    norm = nn.LayerNorm(8)
+    x = th.randn(70, 5)
+    close(
+        chained(compact[0], norm, compact[1], compact[2])(x),
+        nn.Sequential(dense[0], norm, dense[1], dense[2])(x),
+    )
+
+
+def chained(*modules: nn.Module) -> nn.Sequential:
+    sequence = nn.Sequential(*modules)
+    chain_up(sequence)
+    return sequence

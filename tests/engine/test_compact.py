@@ -1,0 +1,245 @@
+"""The compact storage beside the masked one: same moves, same moments, same saved form."""
+
+from __future__ import annotations
+
+import copy
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch as th
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from stable_baselines3.common.utils import polyak_update
+from torch import nn
+
+from sb3_sparse.engine.compact import CompactLayer
+from sb3_sparse.engine.linear import AWAITING, CompactLinear, replace_data
+from sb3_sparse.engine.masked import MaskedLayer
+from sb3_sparse.errors import CorruptStateError, TopologyError
+from sb3_sparse.topology import Exchange
+
+ROWS, COLUMNS = 4, 6
+
+
+def twins(seed: int = 0, target: bool = True, optimizer=th.optim.Adam) -> list[SimpleNamespace]:
+    """The same layer, its target and its optimizer, masked and compact."""
+    found = []
+    for compact in (False, True):
+        th.manual_seed(seed)
+        module, copied = nn.Linear(COLUMNS, ROWS), nn.Linear(COLUMNS, ROWS)
+        layer = MaskedLayer("layer", module)
+        layer.set_mask(np.random.default_rng(seed).random((ROWS, COLUMNS)) < 0.5)
+        if target:
+            layer.add_target(copied)
+        made = optimizer(module.parameters(), lr=0.1)
+        if compact:
+            layer = CompactLayer(layer, [made])
+        found.append(SimpleNamespace(layer=layer, module=module, target=copied, optimizer=made))
+    return found
+
+
+def step(side: SimpleNamespace, seed: int = 0) -> th.Tensor:
+    """One step on a random loss; the dense gradient of the weight."""
+    random = th.Generator().manual_seed(seed)
+    x, g = (th.randn(5, n, generator=random) for n in (COLUMNS, ROWS))
+    side.optimizer.zero_grad()
+    side.module(x).backward(g)
+    if not side.layer.compact:
+        side.module.weight.grad.mul_(side.layer.float_mask)
+    side.optimizer.step()
+    return g.T @ x
+
+
+def exchange_of(layer, drop: int, grow: int, seed: int = 0) -> Exchange:
+    random, mask = np.random.default_rng(seed), layer.mask()
+    active, inactive = np.flatnonzero(mask), np.flatnonzero(~mask)
+    return Exchange(
+        np.sort(random.choice(active, min(drop, active.size - 1), replace=False)),
+        np.sort(random.choice(inactive, min(grow, inactive.size), replace=False)),
+    )
+
+
+def moments(side: SimpleNamespace) -> list[np.ndarray]:
+    state = side.optimizer.state[side.module.weight]
+    return [side.layer.saved_moment(v).numpy() for v in state.values() if v.dim()]
+
+
+def same(masked: SimpleNamespace, compact: SimpleNamespace) -> None:
+    ours, theirs = compact.layer, masked.layer
+    assert ours.nnz == theirs.nnz == int(theirs.mask().sum())
+    np.testing.assert_array_equal(ours.mask(), theirs.mask())
+    np.testing.assert_allclose(ours.dense(), theirs.dense(), rtol=1e-5, atol=1e-7)
+    for one, other in zip(moments(masked), moments(compact), strict=True):
+        np.testing.assert_allclose(other, one, rtol=1e-5, atol=1e-7)
+    for name in ("module", "target"):
+        one, other = getattr(masked, name).state_dict(), getattr(compact, name).state_dict()
+        assert list(one) == list(other)
+        for key in one:
+            assert one[key].dtype == other[key].dtype
+            np.testing.assert_allclose(other[key], one[key], rtol=1e-5, atol=1e-7, err_msg=key)
+    if masked.module.weight.grad is not None:
+        grown = masked.module.weight.grad.reshape(-1)[theirs.mask()]
+        np.testing.assert_allclose(compact.module.weight.grad, grown, rtol=1e-4, atol=1e-6)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    seed=st.integers(0, 99),
+    moves=st.lists(st.tuples(st.integers(0, 6), st.integers(0, 6)), max_size=4),
+    soft=st.booleans(),
+    dense=st.booleans(),
+    optimizer=st.sampled_from([th.optim.Adam, th.optim.RMSprop, th.optim.SGD]),
+)
+def test_any_moves_leave_both_storages_alike(seed, moves, soft, dense, optimizer):
+    masked, compact = sides = twins(seed, optimizer=optimizer)
+    for i, (drop, grow) in enumerate(moves):
+        gradients = [step(side, i) for side in sides]
+        exchange = exchange_of(masked.layer, drop, grow, i)
+        for side, gradient in zip(sides, gradients, strict=True):
+            side.layer.move(
+                exchange,
+                [side.optimizer],
+                soft_targets=soft,
+                dense_grad=gradient if dense else None,
+            )
+        same(masked, compact)
+        for side in sides:
+            tau = 0.5 if soft else 1.0
+            if soft or i % 2:
+                polyak_update(side.module.parameters(), side.target.parameters(), tau)
+        same(masked, compact)
+
+
+def test_the_parameter_holds_the_active_values_by_rows():
+    masked, compact = twins()
+    assert compact.module.weight.shape == (masked.layer.nnz,)
+    assert isinstance(compact.module, nn.Linear)
+    np.testing.assert_array_equal(
+        compact.module.weight.detach(), masked.layer.dense()[masked.layer.mask()]
+    )
+
+
+def test_a_hard_target_computes_with_its_snapshot_until_it_is_copied():
+    _, side = twins()
+    before = side.target.dense()
+    x = th.randn(3, COLUMNS)
+    with th.no_grad():
+        expected = side.target(x)
+        side.layer.move(exchange_of(side.layer, 4, 2), soft_targets=False)
+        assert side.target.weight.shape == (side.layer.nnz,)
+        assert (side.target.weight == AWAITING).all()
+        np.testing.assert_array_equal(side.target(x), expected)
+        side.layer.move(exchange_of(side.layer, 1, 3, seed=1), soft_targets=False)
+        np.testing.assert_array_equal(side.target.dense(), before)
+        polyak_update(side.module.parameters(), side.target.parameters(), 1.0)
+        np.testing.assert_array_equal(side.target(x), side.module(x))
+    assert side.target.snapshot is None
+
+
+def test_a_target_with_weights_outside_the_mask_keeps_them_when_loaded():
+    _, side = twins()
+    dense = {k: th.randn_like(v) for k, v in nn.Linear(COLUMNS, ROWS).state_dict().items()}
+    side.target.load_state_dict(dense)
+    np.testing.assert_array_equal(side.target.state_dict()["weight"], dense["weight"])
+    assert (side.target.weight == AWAITING).all()
+    side.layer.mask_targets()
+    np.testing.assert_array_equal(
+        side.target.dense().reshape(-1), dense["weight"].reshape(-1) * side.layer.mask()
+    )
+
+
+def test_a_mask_of_another_layer_is_taken_over_with_moments_and_targets():
+    masked, compact = twins()
+    for side in (masked, compact):
+        step(side)
+    other = twins(seed=5)[0]
+    for side in (masked, compact):
+        side.optimizer.zero_grad()
+        side.module.load_state_dict(other.module.state_dict())
+        assert side.layer.moments_stale
+        side.layer.settle_moments([side.optimizer])
+        side.layer.mask_targets()
+    same(masked, compact)
+
+
+@pytest.mark.parametrize("first", ["module", "optimizer"])
+def test_either_storage_takes_up_what_the_other_saved(first):
+    masked, compact = twins()
+    step(masked)
+    masked.optimizer.zero_grad()
+    saved = masked.module.state_dict(), masked.optimizer.state_dict()
+    fresh = twins(seed=7)[1]
+    for what in (first, *({"module", "optimizer"} - {first})):
+        if what == "module":
+            fresh.module.load_state_dict(saved[0])
+        else:
+            fresh.optimizer.load_state_dict(saved[1])
+    fresh.target.load_state_dict(masked.target.state_dict())
+    fresh.layer.settle_moments([fresh.optimizer])
+    same(masked, fresh)
+    step(masked, 1)
+    step(fresh, 1)
+    same(masked, fresh)
+
+
+def test_weights_without_a_mask_are_masked():
+    _, compact = twins()
+    dense = nn.Linear(COLUMNS, ROWS).state_dict()
+    compact.module.load_state_dict(dense)
+    mask = compact.layer.mask()
+    np.testing.assert_array_equal(compact.layer.dense(), dense["weight"].reshape(-1) * mask)
+
+
+def test_an_exchange_that_does_not_fit_is_refused_and_changes_nothing():
+    _, compact = twins()
+    before = compact.layer.mask()
+    active = np.flatnonzero(before)
+    with pytest.raises(TopologyError, match="some of the grown are"):
+        compact.layer.move(Exchange(active[:1], active[1:2]))
+    np.testing.assert_array_equal(compact.layer.mask(), before)
+
+
+def test_wrong_shapes_and_empty_masks_are_refused_at_load():
+    _, compact = twins()
+    saved = compact.module.state_dict()
+    with pytest.raises(RuntimeError, match=r"size mismatch for weight: .*\(4, 5\)"):
+        compact.module.load_state_dict({**saved, "weight": th.zeros(ROWS, 5)})
+    with pytest.raises(RuntimeError, match="size mismatch for weight_mask"):
+        compact.module.load_state_dict({**saved, "weight_mask": th.ones(3).bool()})
+    with pytest.raises(CorruptStateError, match="has no connection"):
+        compact.module.load_state_dict({**saved, "weight_mask": th.zeros(ROWS, COLUMNS).bool()})
+    with pytest.raises(RuntimeError, match="Missing key"):
+        compact.module.load_state_dict({k: v for k, v in saved.items() if k != "weight"})
+
+
+def test_copies_are_independent():
+    _, compact = twins()
+    twin = copy.deepcopy(compact)
+    step(twin)
+    twin.layer.move(exchange_of(twin.layer, 3, 3), [twin.optimizer])
+    assert twin.layer.module is twin.module
+    assert (twin.layer.mask() != compact.layer.mask()).any()
+    fresh = twins()[1]
+    np.testing.assert_array_equal(compact.layer.dense(), fresh.layer.dense())
+
+
+def test_a_parameter_may_change_its_size_while_an_older_graph_is_alive():
+    weight = nn.Parameter(th.ones(5))
+    loss = weight.square().sum()
+    loss.backward()
+    replace_data(weight, th.full((3,), 2.0))
+    newer = weight.square().sum()
+    newer.backward()
+    assert weight.grad.tolist() == [4.0] * 3
+    assert loss.grad_fn is not None
+
+
+def test_only_linear_layers_are_compacted():
+    from sb3_sparse.engine.compact import compacted
+
+    conv = MaskedLayer("conv", nn.Conv2d(1, 2, 3))
+    assert compacted(conv, []) is conv
+    linear = compacted(MaskedLayer("linear", nn.Linear(2, 3)), [])
+    assert isinstance(linear.module, CompactLinear)
+    assert compacted(linear, []) is linear
