@@ -53,7 +53,7 @@ def compile_kernels(source: Path, library: Path, extra: tuple[str, ...] = ()) ->
     variants: dict[str, list[str]] = {"plain": []}
     if platform.machine().lower() in ("x86_64", "amd64"):
         variants.update(avx2=AVX2, avx512=AVX512)
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory(dir=library.parent) as folder:
         objects = []
         for suffix, flags in variants.items():
             objects.append(str(Path(folder, f"{suffix}.o")))
@@ -68,9 +68,7 @@ def compile_kernels(source: Path, library: Path, extra: tuple[str, ...] = ()) ->
              str(made), "-pthread"],
             check=True, capture_output=True, text=True,
         )  # fmt: skip
-        # Not over the old one, which a running process may have mapped.
-        library.unlink(missing_ok=True)
-        shutil.move(made, library)
+        made.replace(library)  # at once: a running process keeps the old one
 
 
 class KernelsHook(BuildHookInterface[Any]):
@@ -80,10 +78,10 @@ class KernelsHook(BuildHookInterface[Any]):
         """As in hatchling: called before the wheel is put together."""
         root = Path(self.root)
         library = root / LIBRARY
-        library.unlink(missing_ok=True)
         try:
             compile_kernels(root / NATIVE, library)
         except (OSError, subprocess.CalledProcessError) as error:
+            library.unlink(missing_ok=True)  # of an earlier build
             reason = getattr(error, "stderr", None) or str(error)
             self.app.display_warning(
                 "sb3_sparse: the sparse kernels were not compiled, so policies compute with masks "

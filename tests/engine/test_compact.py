@@ -168,7 +168,7 @@ def test_either_storage_takes_up_what_the_other_saved(first):
     masked, compact = twins()
     step(masked)
     masked.optimizer.zero_grad()
-    saved = masked.module.state_dict(), masked.optimizer.state_dict()
+    saved = copy.deepcopy((masked.module.state_dict(), masked.optimizer.state_dict()))
     fresh = twins(seed=7)[1]
     for what in (first, *({"module", "optimizer"} - {first})):
         if what == "module":

@@ -1,0 +1,83 @@
+"""Calls the kernels on buffers of exactly the size they need; a program of test_native.
+
+Without torch, so that every buffer is NumPy's own and the address sanitizer watches its ends.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import sys
+
+import numpy as np
+
+TILE = 64
+
+
+def address(array: np.ndarray | None) -> int:
+    return 0 if array is None else array.ctypes.data
+
+
+def buffer(*shape: int) -> np.ndarray:
+    return np.zeros(shape, dtype=np.float32)
+
+
+def structure(random, rows: int, columns: int, density: float, broken: bool) -> list[np.ndarray]:
+    row, column = np.nonzero(random.random((rows, columns)) < density)
+    order = np.argsort(column, kind="stable")
+    starts = [
+        np.concatenate([[0], np.cumsum(np.bincount(index, minlength=count))])
+        for index, count in ((row, rows), (column, columns))
+    ]
+    if broken:
+        column = np.where(column == columns - 1, columns + 5, column)
+    parts = [starts[0], column, starts[1], row[order], order]
+    return [np.ascontiguousarray(part, dtype=np.int32) for part in parts]
+
+
+def one_pass(lib, random, widths: list[int], batch: int, tiled: bool, threads: int, broken: bool):
+    tiles = -(-batch // TILE)
+    layers, kept = [], []
+    for columns, rows in zip(widths, widths[1:], strict=False):
+        arrays = structure(random, rows, columns, random.choice([0.0, 0.3, 1.0]), broken)
+        nnz = len(arrays[1])
+        values, bias = buffer(nnz), buffer(rows) if random.random() < 0.5 else None
+        grads = buffer(nnz), None if bias is None else buffer(rows)
+        output, left = buffer(tiles, rows, TILE), buffer(tiles, rows, TILE)
+        kept += [arrays, values, bias, grads, output, left]
+        layers += [rows, columns, int(random.random() < 0.5), *map(address, arrays)]
+        layers += map(address, (values, bias, output, *grads, left))
+    packed = (ctypes.c_int64 * len(layers))(*layers)
+    into, out = widths[0], widths[-1]
+    shape_in = (tiles, into, TILE) if tiled else (batch, into)
+    shape_out = (tiles, out, TILE) if tiled else (batch, out)
+    x, dx, y, dy = buffer(*shape_in), buffer(*shape_in), buffer(*shape_out), buffer(*shape_out)
+    work = x if tiled else buffer(tiles, into, TILE)
+    where = (0, address(dy), 0, address(dx)) if tiled else (address(dy), 0, address(dx), 0)
+    rows_in, rows_out = (0, 0) if tiled else (address(x), address(y))
+    argument = (ctypes.c_int64 * 10)(
+        len(widths) - 1, batch, threads, address(work), rows_in, rows_out, *where
+    )
+    lib.sb3_sparse_forward(packed, argument)
+    assert lib.sb3_sparse_backward(packed, argument) == 0
+    lone, spare, result = buffer(into), buffer(2 * max(widths[1:])), buffer(out)
+    pointers = [ctypes.c_void_p(address(array)) for array in (lone, spare, result)]
+    lib.sb3_sparse_single(packed, ctypes.c_int64(len(widths) - 1), *pointers)
+
+
+def main() -> None:
+    path, instructions, *broken = sys.argv[1:]
+    lib = ctypes.CDLL(path)
+    assert lib.sb3_sparse_use(instructions.encode()) == 0
+    random = np.random.default_rng(0)
+    count = 0
+    for batch in (1, 3, 16, 17, 63, 64, 65, 130):
+        for tiled in (False, True):
+            for threads in (1, 2):
+                widths = random.integers(1, 40, size=random.integers(2, 5)).tolist()
+                one_pass(lib, random, widths, batch, tiled, threads, bool(broken))
+                count += 1
+    print(count, "passes")
+
+
+if __name__ == "__main__":
+    main()
