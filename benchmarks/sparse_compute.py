@@ -1,0 +1,316 @@
+"""What computing on the non-zeros gains, and which rivals win.
+
+All variants of a case are timed in turn in one process; the medians of the ratios, round by round,
+are what counts. Rows are appended to a CSV file as they come.
+
+    python benchmarks/sparse_compute.py                     # layers, and steps 256 and 1024 wide
+    python benchmarks/sparse_compute.py --steps --widths 256,512,1024,2048,4096   # hours
+    python benchmarks/sparse_compute.py --steps --algos SAC --widths 256 --rounds 41
+    python benchmarks/sparse_compute.py --learn             # learn() on HalfCheetah-v5, 1024 wide
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import gc
+import time
+from collections.abc import Callable, Iterator
+from contextlib import nullcontext
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3 import DQN, SAC, TD3
+from step_overhead import TORQUES, VECTOR, RandomEnv, fused_like_stock, off_policy, on_policy
+from torch.nn import functional
+
+from sb3_sparse.engine.chains import TILE, Chain, tiles_of
+from sb3_sparse.engine.linear import CompactLinear
+from sb3_sparse.engine.native.library import in_use
+from sb3_sparse.engine.structure import Structure
+from sb3_sparse.sparsity.widths import equivalent_widths
+
+Variant = tuple[Any, Callable[[], None], int]
+
+
+def interleaved(steps: dict[str, Callable[[], Any]], rounds: int) -> dict[str, list[float]]:
+    """Seconds of each, ``rounds`` times in turn, after one round to warm up."""
+    times: dict[str, list[float]] = {name: [] for name in steps}
+    for _ in range(rounds + 1):
+        for name, step in steps.items():
+            start = time.perf_counter()
+            step()
+            times[name].append(time.perf_counter() - start)
+    return {name: found[1:] for name, found in times.items()}
+
+
+def speedup(times: dict[str, list[float]], name: str, base: str) -> float:
+    return median(a / b for a, b in zip(times[base], times[name], strict=True))
+
+
+# --- one layer ----------------------------------------------------------------------------------
+
+
+def layer_steps(width: int, batch: int, sparsity: float) -> dict[str, Callable[[], Any]]:
+    """Forward and backward of a square layer with ReLU, dense and on its non-zeros."""
+    random = np.random.default_rng(0)
+    nnz = round(width * width * (1 - sparsity))
+    flat = np.sort(random.choice(width * width, nnz, replace=False))
+    dense, twin = th.nn.Linear(width, width), th.nn.Linear(width, width)
+    x = th.randn(batch, width, requires_grad=True)
+    grad = th.randn(batch, width)
+    layer = CompactLinear.convert(twin, Structure(flat, (width, width)), is_target=False)
+    chain = Chain([layer], [True])
+    tiles = th.randn(tiles_of(batch), width, TILE, requires_grad=True)
+    tiles_grad = th.randn(tiles_of(batch), width, TILE)
+    csr = th.zeros(width * width)
+    csr[flat] = layer.weight.detach()
+    with_csr = csr.view(width, width).to_sparse_csr().requires_grad_(True)
+    turned = x.detach().T.contiguous().requires_grad_(True)
+
+    def backward(y: th.Tensor, inputs: list[th.Tensor], grad: th.Tensor) -> None:
+        th.autograd.grad(y, inputs, grad)
+
+    def in_bf16() -> None:
+        with th.autocast("cpu", dtype=th.bfloat16):
+            y = functional.relu(functional.linear(x, dense.weight, dense.bias))
+        backward(y, [x, *dense.parameters()], grad.bfloat16())
+
+    return {
+        "dense": lambda: backward(
+            functional.relu(functional.linear(x, dense.weight, dense.bias)),
+            [x, *dense.parameters()],
+            grad,
+        ),
+        "non-zeros, tiles": lambda: backward(
+            chain.run(tiles, batch, True, True), [tiles, *layer.parameters()], tiles_grad
+        ),
+        "non-zeros, rows": lambda: backward(chain(x), [x, *layer.parameters()], grad),
+        "torch CSR": lambda: backward(
+            functional.relu(with_csr @ turned + layer.bias[:, None]),
+            [turned, with_csr, layer.bias],
+            grad.T.contiguous(),
+        ),
+        "dense bf16": in_bf16,
+    }
+
+
+def time_layers(widths: list[int], sparsities: list[float], rounds: int) -> Iterator[dict]:
+    for width in widths:
+        for batch in (32, 256):
+            for sparsity in sparsities:
+                steps = layer_steps(width, batch, sparsity)
+                inner = max(1, round(2e8 / (6 * width * width * batch)))
+                repeated = {
+                    name: (lambda step=step, inner=inner: [step() for _ in range(inner)])
+                    for name, step in steps.items()
+                }
+                times = interleaved(repeated, rounds)
+                for name in steps:
+                    yield {
+                        "what": "layer",
+                        "case": f"{width}x{width}",
+                        "batch": batch,
+                        "sparsity": sparsity,
+                        "variant": name,
+                        "milliseconds": 1e3 * median(times[name]) / inner,
+                        "speedup": speedup(times, name, "dense"),
+                    }
+
+
+# --- whole gradient steps -----------------------------------------------------------------------
+
+ALGOS = {
+    "SAC": (SAC, RandomEnv(VECTOR, TORQUES), 256),
+    "TD3": (TD3, RandomEnv(VECTOR, TORQUES), 256),
+    "DQN": (DQN, RandomEnv(VECTOR, spaces.Discrete(4)), 128),
+    "PPO": (None, RandomEnv(VECTOR, TORQUES), 64),
+}
+
+
+def maker(algo: str, widths: list[int], steps: int) -> Callable[..., Variant]:
+    kind, env, batch = ALGOS[algo]
+    if kind is None:
+        make = on_policy(env, batch, batch * steps)
+        return lambda policy, kwargs: make(policy, dict(kwargs, net_arch=widths))
+    return off_policy(kind, env, batch, steps, net_arch=widths)
+
+
+def state_bytes(model: Any) -> int:
+    """Parameters, targets, moments, gradients, masks and indices."""
+    policy = model.policy
+    tensors = {id(t): t for t in (*policy.parameters(), *policy.buffers())}
+    for parameter in policy.parameters():
+        if parameter.grad is not None:
+            tensors[id(parameter.grad)] = parameter.grad
+    structures = {}
+    for module in policy.modules():
+        if isinstance(module, CompactLinear):
+            structures[id(module.structure)] = module.structure
+        optimizer = getattr(module, "optimizer", None)
+        for state in optimizer.state.values() if optimizer is not None else ():
+            tensors.update({id(t): t for t in state.values() if isinstance(t, th.Tensor)})
+    return sum(t.nbytes for t in tensors.values()) + sum(s.nbytes for s in structures.values())
+
+
+def narrow(algo: str, width: int, parameters: int) -> list[int]:
+    """Widths of the dense network with as many parameters."""
+
+    def count(widths: list[int]) -> int:
+        model, _, _ = maker(algo, widths, 1)("MlpPolicy", {})
+        trained = {id(p): p for o in optimizers(model) for g in o.param_groups for p in g["params"]}
+        return sum(p.numel() for p in trained.values())
+
+    return equivalent_widths([width, width], count, parameters)[0]
+
+
+def optimizers(model: Any) -> list[th.optim.Optimizer]:
+    found = {id(o): o for m in model.policy.modules() if (o := getattr(m, "optimizer", None))}
+    return list(found.values())
+
+
+def time_steps(
+    algo: str, width: int, sparsities: list[float], rounds: int, bf16: bool
+) -> Iterator[dict]:
+    """Each sparsity beside its rivals; those that do not depend on it are measured with each."""
+    steps = max(2, min(20, round(20 * (256 / width) ** 2)))
+    make = maker(algo, [width, width], steps)
+    for sparsity in sparsities:
+        stock = make("MlpPolicy", {})
+        fused = fused_like_stock(stock[0])
+        variants: dict[str, Variant] = {
+            "dense, stock": stock,
+            "dense, fused Adam": make("MlpPolicy", dict(fused)),
+            "masked": make("SparsePolicy", dict(sparsity=sparsity, compute="masked")),
+            "non-zeros": make("SparsePolicy", dict(sparsity=sparsity, compute="sparse")),
+            "auto": make("SparsePolicy", dict(sparsity=sparsity, compute="auto")),
+        }
+        report = variants["masked"][0].policy.sparsity_report()
+        if sparsity:
+            widths = narrow(algo, width, report.parameters)
+            like = maker(algo, widths, steps)
+            variants[f"narrow dense {widths[0]}"] = like("MlpPolicy", dict(fused))
+        context: dict[str, Any] = {}
+        if bf16:
+            variants["dense bf16"] = make("MlpPolicy", dict(fused))
+            context["dense bf16"] = lambda: th.autocast("cpu", dtype=th.bfloat16)
+
+        def timed(name: str, train: Callable[[], None], context=context) -> Callable[[], None]:
+            def run() -> None:
+                with context.get(name, nullcontext)():
+                    train()
+
+            return run
+
+        trains = {name: timed(name, train) for name, (_, train, _) in variants.items()}
+        variants["auto"][1]()  # sees the batch size; the next one chooses
+        times = interleaved(trains, rounds)
+        for name, (model, _, count) in variants.items():
+            yield {
+                "what": "step",
+                "case": f"{algo} {width}",
+                "batch": ALGOS[algo][2],
+                "sparsity": sparsity,
+                "variant": name,
+                "milliseconds": 1e3 * median(times[name]) / count,
+                "speedup": speedup(times, name, "dense, stock"),
+                "megabytes": state_bytes(model) / 1e6,
+            }
+        del variants, trains
+        gc.collect()
+
+
+# --- learn() end to end -------------------------------------------------------------------------
+
+
+def time_learn(width: int, sparsity: float, steps: int, rounds: int) -> Iterator[dict]:
+    """Environment steps and gradient steps of SAC on HalfCheetah-v5, one each in turn."""
+    kinds = {
+        "dense, stock": ("MlpPolicy", {}),
+        "masked": ("SparsePolicy", dict(sparsity=sparsity, compute="masked")),
+        "auto": ("SparsePolicy", dict(sparsity=sparsity)),
+    }
+    models = {
+        name: SAC(
+            policy, "HalfCheetah-v5", seed=0, learning_starts=300, buffer_size=20_000,
+            policy_kwargs=dict(kwargs, net_arch=[width, width]),
+        ).learn(310)
+        for name, (policy, kwargs) in kinds.items()
+    }  # fmt: skip
+
+    def learn(model: SAC) -> Callable[[], Any]:
+        return lambda: model.learn(steps, reset_num_timesteps=False)
+
+    times = interleaved({name: learn(model) for name, model in models.items()}, rounds)
+    for name in models:
+        yield {
+            "what": "learn",
+            "case": f"SAC {width}, HalfCheetah-v5",
+            "batch": 256,
+            "sparsity": sparsity,
+            "variant": name,
+            "milliseconds": 1e3 * median(times[name]) / steps,
+            "speedup": speedup(times, name, "dense, stock"),
+        }
+
+
+FIELDS = ["what", "case", "batch", "sparsity", "variant", "milliseconds", "speedup", "megabytes"]
+
+
+def main() -> None:
+    def numbers(kind: Callable[[str], Any]) -> Callable[[str], list[Any]]:
+        return lambda text: [kind(part) for part in text.split(",")]
+
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--layers", action="store_true", help="only layers")
+    parser.add_argument("--steps", action="store_true", help="only gradient steps")
+    parser.add_argument("--learn", action="store_true", help="only learn() on HalfCheetah-v5")
+    parser.add_argument("--algos", type=numbers(str), default=["SAC", "TD3", "DQN", "PPO"])
+    parser.add_argument("--widths", type=numbers(int), default=[256, 1024])
+    parser.add_argument("--sparsities", type=numbers(float), default=[0.8, 0.9, 0.95, 0.99])
+    parser.add_argument("--rounds", type=int, default=9)
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--csv", type=Path, default=Path("sparse_compute.csv"))
+    args = parser.parse_args()
+    th.set_num_threads(args.threads)
+    bf16 = th.backends.mkldnn.is_available() and th.ops.mkldnn._is_mkldnn_bf16_supported()
+    print(
+        f"torch {th.__version__}, {args.threads} thread(s), {in_use()} kernels, "
+        f"bf16 {'yes' if bf16 else 'no'}, median of {args.rounds} interleaved rounds\n"
+    )
+    everything = not (args.layers or args.steps or args.learn)
+    rows: list[Iterator[dict]] = []
+    if args.layers or everything:
+        rows.append(time_layers(args.widths, args.sparsities, args.rounds))
+    if args.steps or everything:
+        rows += [
+            time_steps(algo, width, args.sparsities, args.rounds, bf16)
+            for width in args.widths
+            for algo in args.algos
+        ]
+    if args.learn:
+        rows.append(time_learn(1024, 0.95, 100, args.rounds))
+    new = not args.csv.exists()
+    with args.csv.open("a", newline="") as file:
+        writer = csv.DictWriter(file, FIELDS)
+        if new:
+            writer.writeheader()
+        for part in rows:
+            for row in part:
+                writer.writerow(row)
+                file.flush()
+                print(
+                    f"{row['what']:<5} {row['case']:<26} batch {row['batch']:>3}  "
+                    f"{row['sparsity']:.0%}  {row['variant']:<20} {row['milliseconds']:9.3f} ms  "
+                    f"{row['speedup']:6.2f}x"
+                    + (f"  {row['megabytes']:8.2f} MB" if "megabytes" in row else ""),
+                    flush=True,
+                )
+
+
+if __name__ == "__main__":
+    main()
