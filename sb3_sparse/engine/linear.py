@@ -9,7 +9,7 @@ from torch import nn
 
 from sb3_sparse.engine.chains import Chain
 from sb3_sparse.engine.structure import Structure
-from sb3_sparse.errors import CorruptStateError
+from sb3_sparse.errors import CorruptStateError, UnsupportedError
 
 MASK_KEY = "weight_mask"
 AWAITING = float(th.finfo(th.float32).max)
@@ -63,6 +63,15 @@ class CompactLinear(nn.Linear):
     def forward(self, input: th.Tensor) -> th.Tensor:
         """As of ``nn.Linear``."""
         return Chain([self], [False])(input)
+
+    def _apply(self, fn: Any, recurse: bool = True) -> Any:
+        probe = fn(th.empty(0))
+        if probe.device.type != "cpu" or probe.dtype != th.float32:
+            raise UnsupportedError(
+                f"layers that compute on non-zeros stay float32 on the CPU, and cannot become "
+                f"{probe.dtype} on {probe.device}; make the policy with compute='masked'"
+            )
+        return super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
 
     def live(self) -> tuple[Structure, th.Tensor]:
         """The connections to compute with now, and their values."""

@@ -118,7 +118,12 @@ class SparsePolicyMixin(BasePolicy):
         twin = type(self).__new__(type(self))
         memo[id(self)] = twin
         twin.__dict__.update(copy.deepcopy(self.__dict__, memo))
+        twin.sparse.attach()
         return twin
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)  # type: ignore[no-untyped-call]
+        self.sparse.attach()  # a copy's hooks do not come along
 
     def _initial_gain(self, layer_name: str) -> float:
         """Gain with which SB3 initialises the layer, relative to its default."""

@@ -16,7 +16,7 @@ from torch import nn
 from sb3_sparse.engine.compact import CompactLayer
 from sb3_sparse.engine.linear import AWAITING, CompactLinear, replace_data
 from sb3_sparse.engine.masked import MaskedLayer
-from sb3_sparse.errors import CorruptStateError, TopologyError
+from sb3_sparse.errors import CorruptStateError, TopologyError, UnsupportedError
 from sb3_sparse.topology import Exchange
 
 ROWS, COLUMNS = 4, 6
@@ -243,3 +243,11 @@ def test_only_linear_layers_are_compacted():
     linear = compacted(MaskedLayer("linear", nn.Linear(2, 3)), [])
     assert isinstance(linear.module, CompactLinear)
     assert compacted(linear, []) is linear
+
+
+@pytest.mark.parametrize("where", [th.float64, "meta"])
+def test_only_float32_on_the_cpu(where):
+    _, compact = twins()
+    with pytest.raises(UnsupportedError, match="make the policy with compute='masked'"):
+        compact.module.to(where)
+    assert compact.module.to("cpu") is compact.module

@@ -280,3 +280,14 @@ def test_every_policy_class_can_be_pickled_by_name():
                 continue
             assert issubclass(policy, SparsePolicyMixin)
             assert pickle.loads(pickle.dumps(policy)) is policy
+
+
+def test_copies_and_pickles_save_moments_in_the_common_form():
+    model = make("SAC", policy_kwargs=dict(compute="sparse")).learn(25)
+    policy = model.policy
+    for twin in (copy.deepcopy(policy), pickle.loads(pickle.dumps(policy))):
+        for one, other in zip(policy.sparse.optimizers, twin.sparse.optimizers, strict=True):
+            for number, state in one.state_dict()["state"].items():
+                for key, value in state.items():
+                    np.testing.assert_array_equal(other.state_dict()["state"][number][key], value)
+                    assert value.dim() != 1 or value.shape[0] in (24, 1)  # biases only
