@@ -12,11 +12,14 @@ are what counts. Rows are appended to a CSV file as they come.
 from __future__ import annotations
 
 import argparse
+import copy
 import csv
 import gc
+import re
 import time
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -99,12 +102,50 @@ def layer_steps(width: int, batch: int, sparsity: float) -> dict[str, Callable[[
     }
 
 
+def time_single(widths: list[int], sparsities: list[float], rounds: int) -> Iterator[dict]:
+    """Forward of three layers on one observation, as in a rollout."""
+    for width in widths:
+        dense = th.nn.Sequential(
+            *(th.nn.Linear(17, width), th.nn.ReLU()),
+            *(th.nn.Linear(width, width), th.nn.ReLU()),
+            th.nn.Linear(width, 6),
+        )
+        x = th.randn(1, 17)
+        for sparsity in sparsities:
+            random = np.random.default_rng(0)
+            layers = []
+            for module in dense[::2]:
+                flat = np.flatnonzero(random.random(module.weight.numel()) >= sparsity)
+                twin = copy.deepcopy(module)
+                shape = tuple(module.weight.shape)
+                layers.append(CompactLinear.convert(twin, Structure(flat, shape), is_target=False))
+            chain = Chain(layers, [True, True, False])
+
+            @th.no_grad()
+            def by(network: Callable[[th.Tensor], th.Tensor], x=x) -> None:
+                for _ in range(200):
+                    network(x)
+
+            steps = {"dense": partial(by, dense), "non-zeros": partial(by, chain)}
+            times = interleaved(steps, rounds)
+            for name in steps:
+                yield {
+                    "what": "one",
+                    "case": f"17-{width}-{width}-6",
+                    "batch": 1,
+                    "sparsity": sparsity,
+                    "variant": name,
+                    "milliseconds": 1e3 * median(times[name]) / 200,
+                    "speedup": speedup(times, name, "dense"),
+                }
+
+
 def time_layers(widths: list[int], sparsities: list[float], rounds: int) -> Iterator[dict]:
     for width in widths:
         for batch in (32, 256):
             for sparsity in sparsities:
                 steps = layer_steps(width, batch, sparsity)
-                inner = max(1, round(2e8 / (6 * width * width * batch)))
+                inner = max(5, round(2e8 / (6 * width * width * batch)))
                 repeated = {
                     name: (lambda step=step, inner=inner: [step() for _ in range(inner)])
                     for name, step in steps.items()
@@ -258,6 +299,30 @@ def time_learn(width: int, sparsity: float, steps: int, rounds: int) -> Iterator
         }
 
 
+def table(path: Path) -> None:
+    """Print what a CSV file holds as Markdown: one line a case, one column a variant."""
+    with path.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    for what in dict.fromkeys(row["what"] for row in rows):
+        found: dict[tuple[str, ...], dict[str, dict[str, str]]] = {}
+        for row in rows:
+            if row["what"] == what:
+                name = re.sub(r" \d+$", "", row["variant"])  # narrow dense 75
+                key = (row["case"], row["batch"], f"{float(row['sparsity']):.0%}")
+                found.setdefault(key, {})[name] = row
+        variants = list(dict.fromkeys(name for case in found.values() for name in case))
+        base, *others = variants
+        print(f"| {what} | batch | sparsity | {base}, ms | {' | '.join(others)} | MB |")
+        print("|---" * (len(variants) + 4) + "|")
+        for key, case in found.items():
+            cells = [f"{float(case[base]['milliseconds']):.3g}"]
+            cells += [f"{float(case[o]['speedup']):.2f}" if o in case else "" for o in others]
+            sizes = [case[v]["megabytes"] for v in ("dense, stock", "masked", "auto") if v in case]
+            cells.append(" / ".join(f"{float(size):.3g}" for size in sizes if size))
+            print("| " + " | ".join([*key, *cells]) + " |")
+        print()
+
+
 FIELDS = ["what", "case", "batch", "sparsity", "variant", "milliseconds", "speedup", "megabytes"]
 
 
@@ -275,7 +340,11 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=9)
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--csv", type=Path, default=Path("sparse_compute.csv"))
+    parser.add_argument("--table", type=Path, help="only print such a CSV file as Markdown")
     args = parser.parse_args()
+    if args.table is not None:
+        table(args.table)
+        return
     th.set_num_threads(args.threads)
     bf16 = th.backends.mkldnn.is_available() and th.ops.mkldnn._is_mkldnn_bf16_supported()
     print(
@@ -286,6 +355,7 @@ def main() -> None:
     rows: list[Iterator[dict]] = []
     if args.layers or everything:
         rows.append(time_layers(args.widths, args.sparsities, args.rounds))
+        rows.append(time_single(args.widths, args.sparsities, args.rounds))
     if args.steps or everything:
         rows += [
             time_steps(algo, width, args.sparsities, args.rounds, bf16)

@@ -261,19 +261,19 @@ static void *backward_share(void *argument) {
     const batch_t *batch = share->batch;
     const layer_t *layers = share->layers, *top = layers + batch->layers - 1;
     int64_t first = share->first, last = share->last;
-    float *g = share->scratch[0];
-    for (int64_t t = first; t < last; t++) {
-        float *to = g + (t - first) * top->rows * TILE;
+    const float *g = share->scratch[0];
+    int64_t size = top->rows * TILE;
+    if (!batch->rows_grad && !top->relu) g = batch->tiles_grad + first * size;
+    for (int64_t t = first; t < last && g == share->scratch[0]; t++) {
+        float *to = share->scratch[0] + (t - first) * size;
+        const float *from = to, *y = top->output + t * size;
         if (batch->rows_grad)
             to_tile(batch->rows_grad + t * TILE * top->rows, entries_of(batch, t), top->rows, to);
         else
-            memcpy(to, batch->tiles_grad + t * top->rows * TILE, top->rows * TILE * sizeof *g);
-        if (top->relu) {
-            const float *y = top->output + t * top->rows * TILE;
-            for (int64_t r = 0; r < top->rows; r++)
-                for (int64_t b = r * TILE; b < r * TILE + vectors_of(batch, t) * WIDTH; b += WIDTH)
-                    STORE(to + b, where_positive(LOAD(to + b), LOAD(y + b)));
-        }
+            from = batch->tiles_grad + t * size;
+        for (int64_t r = 0; r < size && top->relu; r += TILE)
+            for (int64_t b = r; b < r + vectors_of(batch, t) * WIDTH; b += WIDTH)
+                STORE(to + b, where_positive(LOAD(from + b), LOAD(y + b)));
     }
     for (int64_t l = batch->layers - 1; l >= 0; l--) {
         const layer_t *layer = layers + l;
@@ -336,6 +336,22 @@ void NAMED(forward, SUFFIX)(const layer_t *layers, const batch_t *batch) {
     run(forward_share, shares, split(layers, batch, shares));
 }
 
+/* Memory of this thread that stays for the next call: new pages cost as much as the products.
+   The address sanitizer gets exact sizes instead. */
+static float *scratch_of(size_t size) {
+    static _Thread_local float *kept;
+    static _Thread_local size_t kept_size;
+#ifdef __SANITIZE_ADDRESS__
+    kept_size = 0;
+#endif
+    if (size > kept_size) {
+        free(kept);
+        kept = aligned_alloc(64, size);
+        kept_size = kept ? size : 0;
+    }
+    return kept;
+}
+
 int NAMED(backward, SUFFIX)(const layer_t *layers, const batch_t *batch) {
     share_t shares[64];
     int64_t count = split(layers, batch, shares), n = batch->layers;
@@ -350,10 +366,9 @@ int NAMED(backward, SUFFIX)(const layer_t *layers, const batch_t *batch) {
     }
     /* Scratch first: whole tiles, so that each vector lies within a cache line. */
     size_t size = sizeof(float) * (tiles * 2 * widest * TILE + values + (count - 1) * grads);
-    float *memory = aligned_alloc(64, (size + 63) / 64 * 64);
+    float *memory = scratch_of((size + 63) / 64 * 64);
     float **lists = malloc(sizeof *lists * n * (1 + 2 * count));
     if (!memory || !lists) {
-        free(memory);
         free(lists);
         return -1;
     }
@@ -394,7 +409,6 @@ int NAMED(backward, SUFFIX)(const layer_t *layers, const batch_t *batch) {
                 for (int64_t r = 0; r < layer->rows; r++)
                     layer->bias_grad[r] += shares[i].bias_grads[l][r];
         }
-    free(memory);
     free(lists);
     return 0;
 }
