@@ -11,6 +11,7 @@ from stable_baselines3.common.torch_layers import (
 
 from sb3_sparse.errors import MissingExtra
 from sb3_sparse.policies.critics import PassesGradientsOn
+from sb3_sparse.policies.gaussian import quicken
 from sb3_sparse.policies.mixin import SparsePolicyMixin, with_extractor
 from sb3_sparse.policies.sac import GAUSSIAN_ACTOR, TWIN_CRITIC
 from sb3_sparse.policies.spec import NetworkSpec
@@ -31,6 +32,9 @@ class SparseTQCPolicy(SparsePolicyMixin, TQCPolicy):
     """Sparse actor and quantile critics for TQC."""
 
     networks = {"actor": GAUSSIAN_ACTOR, "critic": TWIN_CRITIC}
+
+    def _quicken(self) -> None:
+        quicken(self.actor)
 
     def make_critic(
         self, features_extractor: BaseFeaturesExtractor | None = None
@@ -75,6 +79,9 @@ class SparseCrossQPolicy(SparsePolicyMixin, CrossQPolicy):
             roots=("critic",), trunks=("critic.qf*",), heads=("critic.qf*",), owner="critic"
         ),
     }
+
+    def _quicken(self) -> None:
+        quicken(self.actor)
 
     def make_critic(
         self, features_extractor: BaseFeaturesExtractor | None = None

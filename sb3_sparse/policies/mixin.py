@@ -107,6 +107,8 @@ class SparsePolicyMixin(BasePolicy):
         self.sparse = Controller(networks, seed, self.functional_gradients, weight_decay, auto)
         if compute == "sparse":
             self.sparse.compact(self)
+        if not all(layer.full and layer.final_nnz == layer.size for layer in self.sparse.layers):
+            self._quicken()  # a policy without zeros stays stock SB3's to the bit
         self.sparse.attach()
 
     def __deepcopy__(self: Sparse, memo: dict[int, Any]) -> Sparse:
@@ -124,6 +126,9 @@ class SparsePolicyMixin(BasePolicy):
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)  # type: ignore[no-untyped-call]
         self.sparse.attach()  # a copy's hooks do not come along
+
+    def _quicken(self) -> None:
+        """Replace what SB3 computes in more steps than it needs."""
 
     def _initial_gain(self, layer_name: str) -> float:
         """Gain with which SB3 initialises the layer, relative to its default."""

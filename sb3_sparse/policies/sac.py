@@ -11,6 +11,7 @@ from stable_baselines3.common.torch_layers import (
 from stable_baselines3.sac.policies import SACPolicy
 
 from sb3_sparse.policies.critics import SparseContinuousCritic
+from sb3_sparse.policies.gaussian import quicken
 from sb3_sparse.policies.mixin import SparsePolicyMixin, with_extractor
 from sb3_sparse.policies.spec import NetworkSpec
 
@@ -33,6 +34,9 @@ class SparseSACPolicy(SparsePolicyMixin, SACPolicy):
     """Sparse actor and critics for SAC."""
 
     networks = {"actor": GAUSSIAN_ACTOR, "critic": TWIN_CRITIC}
+
+    def _quicken(self) -> None:
+        quicken(self.actor)
 
     def make_critic(
         self, features_extractor: BaseFeaturesExtractor | None = None

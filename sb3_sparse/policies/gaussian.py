@@ -1,0 +1,73 @@
+"""The squashed Gaussian of SAC's actor with fewer, larger steps.
+
+Of a small actor's gradient step SB3's distribution is a tenth: some forty tiny operations, checks
+of arguments and nodes of the graph. Sampling and log probability in one node of the graph are the
+same function of the same random numbers, and its gradient in closed form is shorter still.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch as th
+from stable_baselines3.common.distributions import SquashedDiagGaussianDistribution
+from torch import nn
+
+LOG_OF_ROOT_OF_TWO_PI = 0.5 * math.log(2.0 * math.pi)
+
+
+class _SampleAndLogProb(th.autograd.Function):
+    """``a = tanh(u)`` with ``u = mean + std * noise``, and ``log p(a)`` as SB3 has it.
+
+    ``log p(a) = sum(-noise^2 / 2 - log_std - log(2 pi) / 2 - log(1 - a^2 + epsilon))``
+    """
+
+    @staticmethod
+    def forward(
+        ctx: Any, mean: th.Tensor, log_std: th.Tensor, epsilon: float
+    ) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
+        noise = th.randn(mean.shape, dtype=mean.dtype, device=mean.device)
+        spread = log_std.exp() * noise
+        gaussian = mean + spread
+        action = gaussian.tanh()
+        slope = 1.0 - action.square()
+        inside = slope + epsilon
+        density = noise.square().mul_(0.5).add_(log_std).add_(inside.log())
+        log_prob = density.sum(dim=1).neg_().sub_(mean.shape[1] * LOG_OF_ROOT_OF_TWO_PI)
+        ctx.save_for_backward(action, slope, inside, spread)
+        ctx.mark_non_differentiable(gaussian)
+        return action, log_prob, gaussian
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Any) -> Any:
+        grad_action, grad_log_prob, _ = gradients
+        action, slope, inside, spread = ctx.saved_tensors
+        grad_log_prob = grad_log_prob.unsqueeze(1)
+        grad = (2.0 * grad_log_prob) * action / inside
+        grad = grad.add_(grad_action).mul_(slope)
+        return grad, grad * spread - grad_log_prob, None
+
+
+class QuickSquashedGaussian(SquashedDiagGaussianDistribution):
+    """SB3's distribution with another ``log_prob_from_params``; everything else is SB3's."""
+
+    def log_prob_from_params(
+        self, mean_actions: th.Tensor, log_std: th.Tensor
+    ) -> tuple[th.Tensor, th.Tensor]:
+        """As in SB3: an action and its log probability, shapes ``(n, dim)`` and ``(n,)``."""
+        action, log_prob, self.gaussian_actions = _SampleAndLogProb.apply(  # type: ignore[no-untyped-call]
+            mean_actions, log_std, self.epsilon
+        )
+        if log_prob.isnan().any():  # SB3 says what is wrong
+            return super().log_prob_from_params(mean_actions, log_std)
+        return action, log_prob
+
+
+def quicken(actor: nn.Module) -> None:
+    """Give an actor the quick distribution, where SB3 gave it the plain one (not with gSDE)."""
+    distribution = vars(actor).get("action_dist")
+    if type(distribution) is SquashedDiagGaussianDistribution:
+        vars(actor)["action_dist"] = QuickSquashedGaussian(
+            distribution.action_dim, distribution.epsilon
+        )
