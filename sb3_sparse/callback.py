@@ -164,7 +164,7 @@ class SparsityCallback(BaseCallback):
         record("sparsity/mask_churn", max(network.churn for network in networks))
         record("sparsity/drop_fraction", self.plan.drop_fraction_at(sparse.progress))
         record("sparsity/compact_layers", sum(layer.compact for layer in sparse.layers))
-        choice = None if sparse.auto is None else sparse.auto.choice
+        choice = sparse.choice
         if choice is not None:
             record("sparsity/expected_speedup", choice.speedup)
             if choice is not self._said:

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from stable_baselines3 import DQN, PPO
+from support import make
 
 QUICK = ["--hyperparams", "net_arch:[24,24]", "batch_size:16"]
 
@@ -31,6 +32,7 @@ def test_train_says_what_it_does_and_enjoy_and_inspect_read_it(tmp_path):
     assert done.returncode == 0, done.stderr
     assert "Training DQN on CartPole-v1, rigl at 90% (ERK), seed 3" in done.stdout
     assert re.search(r"1500 of 1500 steps, return \d+\.\d, sparsity 8\d\.\d\d%", done.stdout)
+    assert done.stdout.count("compute='auto' keeps masks: no linear layer") == 1
     assert "Return over 20 episodes:" in done.stdout
     folder = Path("logs") / "dqn" / "CartPole-v1_1"
     for what, name in (("Last policy", "CartPole-v1.zip"), ("Best policy", "best_model.zip")):
@@ -49,6 +51,23 @@ def test_train_says_what_it_does_and_enjoy_and_inspect_read_it(tmp_path):
     nnz, density = re.search(r"total\s+(\d+)\s+(0\.\d+)", done.stdout).groups()
     assert 72 <= int(nnz) <= 75
     assert float(density) == round(int(nnz) / 720, 4)
+    assert "On this machine compute='auto' keeps masks: no linear layer" in done.stdout
+
+
+@pytest.mark.parametrize("compute", ["auto", "sparse"])
+def test_inspect_says_how_large_layers_compute_best(tmp_path, compute):
+    kwargs = dict(sparsity=0.99, net_arch=[300, 300], compute=compute)
+    make("SAC", policy_kwargs=kwargs, batch_size=128).save(tmp_path / "model")
+    done = sb3_sparse("inspect", "model.zip", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert re.search(
+        r"On this machine compute='auto' \(batch 128, 1 thread\): \d of 8 layers measured compute "
+        r"on non-zeros, which should take \d+\.\d\d instead of \d+\.\d\d ms forward and backward",
+        done.stdout,
+    )
+    line = r"critic\.qf1\.2 +(non-zeros|masked) +\d+\.\d{3} ms \(masked \d+\.\d{3} ms\)"
+    assert re.search(line, done.stdout)
+    assert ("was made with compute='sparse'" in done.stdout) == (compute == "sparse")
 
 
 def test_a_killed_run_goes_on_from_its_last_evaluation(tmp_path):

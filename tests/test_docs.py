@@ -7,9 +7,10 @@ import shlex
 from pathlib import Path
 
 import pytest
+from stable_baselines3 import SAC
 from support import assert_masked, make
 
-from sb3_sparse import cli
+from sb3_sparse import SparsePolicy, cli
 from sb3_sparse.topology import registry
 from sb3_sparse.zoo.run import Run
 from sb3_sparse.zoo.train import train
@@ -44,6 +45,16 @@ def test_the_method_of_the_documents_trains():
         assert_masked(model)
     finally:
         registry._METHODS.pop("preferential", None)
+
+
+def test_the_compact_model_of_the_documents_trains():
+    (code,) = python_blocks("docs/compute.md")
+    assert "1024, 1024" in code
+    small = code.replace("1024, 1024", "24, 24").replace("HalfCheetah-v5", "Pendulum-v1")
+    names = {"SAC": SAC, "SparsePolicy": SparsePolicy}
+    exec(compile(small, "docs/compute.md", "exec"), names)
+    assert all(layer.compact for layer in names["model"].policy.sparse.layers)
+    names["model"].learn(110)
 
 
 @pytest.mark.parametrize("path", ["README.md", *(f"docs/{p.name}" for p in ROOT.glob("docs/*.md"))])

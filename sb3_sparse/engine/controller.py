@@ -10,7 +10,7 @@ import torch as th
 from torch import nn
 from torch.utils.hooks import RemovableHandle
 
-from sb3_sparse.engine.auto import AutoCompute
+from sb3_sparse.engine.auto import AutoCompute, Choice
 from sb3_sparse.engine.compact import compacted
 from sb3_sparse.engine.gradients import GradientMask
 from sb3_sparse.engine.layers import SparseLayer
@@ -79,6 +79,11 @@ class Controller:
     def sparsity(self) -> float:
         """Removed fraction of all connections within the budgets, now."""
         return 1.0 - sum(n.nnz for n in self.networks) / sum(n.size for n in self.networks)
+
+    @property
+    def choice(self) -> Choice | None:
+        """What ``compute="auto"`` chose last, if it has."""
+        return None if self.auto is None else self.auto.choice
 
     @property
     def optimizers(self) -> list[th.optim.Optimizer]:

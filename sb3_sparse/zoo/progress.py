@@ -30,6 +30,7 @@ class TrainingProgress(BaseCallback):
     def __init__(self, console: Console) -> None:
         super().__init__()
         self.console = console
+        self._choice: object = None
         self.progress = Progress(
             BarColumn(bar_width=30),
             MofNCompleteColumn(),
@@ -53,7 +54,16 @@ class TrainingProgress(BaseCallback):
             text += f", sparsity {policy.sparse.sparsity:.2%}"
         return text
 
+    def _say_what_was_chosen(self) -> None:
+        policy = self.model.policy
+        if isinstance(policy, SparsePolicyMixin):
+            choice = policy.sparse.choice
+            if choice is not self._choice:
+                self.console.print(str(choice), soft_wrap=True)
+                self._choice = choice
+
     def _on_step(self) -> bool:
+        self._say_what_was_chosen()
         done = min(self.num_timesteps, self.planned)
         if self.n_calls % REFRESH_STEPS == 0 or done == self.planned:
             self.progress.update(self.task, completed=done, status=self._status())
