@@ -122,12 +122,12 @@ class SparseLayer(ABC):
         after = mask.copy()
         after[dropped] = False
         after[grown] = True
-        moved = np.concatenate([dropped, grown])
+        left = np.count_nonzero(after)
         if (
             not mask[dropped].all()
             or mask[grown].any()
-            or np.unique(moved).size != moved.size
-            or not after.any()
+            or left != self.nnz - dropped.size + grown.size  # an index stands twice
+            or left == 0
         ):
             raise TopologyError(
                 f"the exchange for {self.name} drops {dropped.size} and grows {grown.size} of "
