@@ -15,7 +15,6 @@ from sb3_sparse.engine.layers import SparseLayer, moments_of
 from sb3_sparse.engine.linear import CompactLinear
 from sb3_sparse.engine.masked import MaskedLayer
 from sb3_sparse.engine.structure import Structure
-from sb3_sparse.topology import Exchange
 
 
 class CompactLayer(SparseLayer):
@@ -93,7 +92,6 @@ class CompactLayer(SparseLayer):
 
     def _move(
         self,
-        exchange: Exchange,
         mask: NDArray[np.bool_],
         optimizers: Sequence[th.optim.Optimizer],
         soft_targets: bool,

@@ -93,7 +93,6 @@ class SparseLayer(ABC):
     @abstractmethod
     def _move(
         self,
-        exchange: Exchange,
         mask: NDArray[np.bool_],
         optimizers: Sequence[th.optim.Optimizer],
         soft_targets: bool,
@@ -134,7 +133,7 @@ class SparseLayer(ABC):
                 f"{self.nnz} connections, but some of the dropped are not active, some of the "
                 "grown are, an index stands twice, or no connection would be left"
             )
-        self._move(exchange, after, optimizers, soft_targets, dense_grad)
+        self._move(after, optimizers, soft_targets, dense_grad)
 
 
 def moments_of(

@@ -19,7 +19,6 @@ from sb3_sparse.engine.gradients import (
 from sb3_sparse.engine.kernels import Kernel
 from sb3_sparse.engine.layers import SparseLayer, moments_of
 from sb3_sparse.engine.linear import MASK_KEY
-from sb3_sparse.topology import Exchange
 
 FLOAT_MASK_KEY = "weight_mask_float"
 
@@ -141,7 +140,6 @@ class MaskedLayer(SparseLayer):
 
     def _move(
         self,
-        exchange: Exchange,
         mask: NDArray[np.bool_],
         optimizers: Sequence[th.optim.Optimizer],
         soft_targets: bool,

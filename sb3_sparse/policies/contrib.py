@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-from stable_baselines3.common.torch_layers import (
-    BaseFeaturesExtractor,
-    CombinedExtractor,
-    FlattenExtractor,
-    NatureCNN,
-)
+from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, NatureCNN
 
 from sb3_sparse.errors import MissingExtra
-from sb3_sparse.policies.critics import PassesGradientsOn
-from sb3_sparse.policies.gaussian import quicken
+from sb3_sparse.policies.critics import PassesGradientsOn, SparseCriticsMixin
 from sb3_sparse.policies.mixin import SparsePolicyMixin, with_extractor
 from sb3_sparse.policies.sac import GAUSSIAN_ACTOR, TWIN_CRITIC
 from sb3_sparse.policies.spec import NetworkSpec
@@ -28,19 +22,11 @@ class SparseTQCCritic(PassesGradientsOn, Critic):
     """Quantile critic of TQC."""
 
 
-class SparseTQCPolicy(SparsePolicyMixin, TQCPolicy):
+class SparseTQCPolicy(SparseCriticsMixin, TQCPolicy):
     """Sparse actor and quantile critics for TQC."""
 
+    critic_class = SparseTQCCritic
     networks = {"actor": GAUSSIAN_ACTOR, "critic": TWIN_CRITIC}
-
-    def _quicken(self) -> None:
-        quicken(self.actor)
-
-    def make_critic(
-        self, features_extractor: BaseFeaturesExtractor | None = None
-    ) -> SparseTQCCritic:
-        kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
-        return SparseTQCCritic(**kwargs).to(self.device)
 
 
 SparseTQCMlpPolicy = with_extractor(SparseTQCPolicy, "Mlp", FlattenExtractor)
@@ -70,24 +56,16 @@ class SparseCrossQCritic(PassesGradientsOn, CrossQCritic):
     """Critic of CrossQ."""
 
 
-class SparseCrossQPolicy(SparsePolicyMixin, CrossQPolicy):
+class SparseCrossQPolicy(SparseCriticsMixin, CrossQPolicy):
     """Sparse actor and critics for CrossQ, which has no target network."""
 
+    critic_class = SparseCrossQCritic
     networks = {
         "actor": GAUSSIAN_ACTOR,
         "critic": NetworkSpec(
             roots=("critic",), trunks=("critic.qf*",), heads=("critic.qf*",), owner="critic"
         ),
     }
-
-    def _quicken(self) -> None:
-        quicken(self.actor)
-
-    def make_critic(
-        self, features_extractor: BaseFeaturesExtractor | None = None
-    ) -> SparseCrossQCritic:
-        kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
-        return SparseCrossQCritic(**kwargs).to(self.device)
 
 
 SparseCrossQMlpPolicy = with_extractor(SparseCrossQPolicy, "Mlp", FlattenExtractor)

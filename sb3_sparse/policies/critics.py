@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, ClassVar
 
 import torch as th
 from stable_baselines3.common.policies import BaseModel, ContinuousCritic
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
+
+from sb3_sparse.policies.gaussian import quicken
+from sb3_sparse.policies.mixin import SparsePolicyMixin
 
 
 @contextmanager
@@ -45,3 +49,18 @@ class SparseContinuousCritic(PassesGradientsOn, ContinuousCritic):
             return super().q1_forward(obs, actions)
         with _frozen(self):
             return super().q1_forward(obs, actions)
+
+
+class SparseCriticsMixin(SparsePolicyMixin):
+    """What the policies of SAC, TD3, DDPG, TQC and CrossQ have in common."""
+
+    critic_class: ClassVar[type[PassesGradientsOn]] = SparseContinuousCritic
+    critic_kwargs: dict[str, Any]
+
+    def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> Any:
+        """As in SB3, of :attr:`critic_class`."""
+        kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
+        return self.critic_class(**kwargs).to(self.device)
+
+    def _quicken(self) -> None:
+        quicken(self.get_submodule("actor"))

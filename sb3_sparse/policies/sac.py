@@ -2,17 +2,11 @@
 
 from __future__ import annotations
 
-from stable_baselines3.common.torch_layers import (
-    BaseFeaturesExtractor,
-    CombinedExtractor,
-    FlattenExtractor,
-    NatureCNN,
-)
+from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, NatureCNN
 from stable_baselines3.sac.policies import SACPolicy
 
-from sb3_sparse.policies.critics import SparseContinuousCritic
-from sb3_sparse.policies.gaussian import quicken
-from sb3_sparse.policies.mixin import SparsePolicyMixin, with_extractor
+from sb3_sparse.policies.critics import SparseCriticsMixin
+from sb3_sparse.policies.mixin import with_extractor
 from sb3_sparse.policies.spec import NetworkSpec
 
 GAUSSIAN_ACTOR = NetworkSpec(
@@ -30,19 +24,10 @@ TWIN_CRITIC = NetworkSpec(
 )
 
 
-class SparseSACPolicy(SparsePolicyMixin, SACPolicy):
+class SparseSACPolicy(SparseCriticsMixin, SACPolicy):
     """Sparse actor and critics for SAC."""
 
     networks = {"actor": GAUSSIAN_ACTOR, "critic": TWIN_CRITIC}
-
-    def _quicken(self) -> None:
-        quicken(self.actor)
-
-    def make_critic(
-        self, features_extractor: BaseFeaturesExtractor | None = None
-    ) -> SparseContinuousCritic:
-        kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
-        return SparseContinuousCritic(**kwargs).to(self.device)
 
 
 SparseSACMlpPolicy = with_extractor(SparseSACPolicy, "Mlp", FlattenExtractor)

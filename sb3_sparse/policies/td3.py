@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-from stable_baselines3.common.torch_layers import (
-    BaseFeaturesExtractor,
-    CombinedExtractor,
-    FlattenExtractor,
-    NatureCNN,
-)
+from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, NatureCNN
 from stable_baselines3.td3.policies import TD3Policy
 
-from sb3_sparse.policies.critics import SparseContinuousCritic
-from sb3_sparse.policies.mixin import SparsePolicyMixin, with_extractor
+from sb3_sparse.policies.critics import SparseCriticsMixin
+from sb3_sparse.policies.mixin import with_extractor
 from sb3_sparse.policies.sac import TWIN_CRITIC
 from sb3_sparse.policies.spec import NetworkSpec
 
 
-class SparseTD3Policy(SparsePolicyMixin, TD3Policy):
+class SparseTD3Policy(SparseCriticsMixin, TD3Policy):
     """Sparse actor and critics for TD3 and DDPG."""
 
     networks = {
@@ -29,12 +24,6 @@ class SparseTD3Policy(SparsePolicyMixin, TD3Policy):
         ),
         "critic": TWIN_CRITIC,
     }
-
-    def make_critic(
-        self, features_extractor: BaseFeaturesExtractor | None = None
-    ) -> SparseContinuousCritic:
-        kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
-        return SparseContinuousCritic(**kwargs).to(self.device)
 
 
 SparseTD3MlpPolicy = with_extractor(SparseTD3Policy, "Mlp", FlattenExtractor)
