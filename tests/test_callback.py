@@ -13,6 +13,7 @@ from stable_baselines3.common.logger import configure
 from support import assert_masked, make, registered
 
 from sb3_sparse import SparsityCallback
+from sb3_sparse.engine import chains
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.topology import DropGrow
 
@@ -81,6 +82,24 @@ def test_a_single_loss_is_handed_over_bit_for_bit(name, gradient_spy):
     for layer_name, updates in gradient_spy.items():
         for k, dense_grad in enumerate(updates, start=1):
             np.testing.assert_array_equal(dense_grad, raw[layer_name][4 * k - 1])
+
+
+@pytest.mark.parametrize(("method", "dense"), [("rigl", True), ("set", True), ("static", False)])
+@pytest.mark.parametrize("name", ["SAC", "DQN", "PPO", "TRPO"])
+def test_compact_layers_compute_dense_gradients_for_updates_only(name, method, dense, monkeypatch):
+    computed = []
+    outer = chains._outer
+    monkeypatch.setattr(chains, "_outer", lambda *args: computed.append(0) or outer(*args))
+    model = make(name, policy_kwargs=dict(compute="sparse"))
+    options = {} if method == "static" else {"update_interval": 6}
+    model.learn(64, callback=SparsityCallback(method, **options))
+    due = {
+        network.name: sum(6 * k <= network.clock for k in range(1, 99))
+        for network in model.policy.sparse.networks
+    }
+    layers = {network.name: len(network.layers) for network in model.policy.sparse.networks}
+    assert (len(computed) > 0) == dense
+    assert len(computed) <= sum(due[network] * layers[network] for network in due)
 
 
 def test_trpos_actor_grows_by_the_gradient_of_its_objective(gradient_spy):

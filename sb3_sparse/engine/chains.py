@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 from weakref import ref
 
@@ -253,7 +254,7 @@ class _Products(th.autograd.Function):
             raise MemoryError("no memory for the gradient of a chain of compact layers")
         inputs = how.inputs(x, work) if listening else []
         for i, listener, left in listening:
-            listener.note(_outer(left, inputs[i], how.batch))
+            listener.note(partial(_outer, left, inputs[i], how.batch))
         return None, grad_x, *grads
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ import torch as th
 from numpy.typing import NDArray
 from torch import nn
 
-from sb3_sparse.engine.gradients import GradientMask, weakly
+from sb3_sparse.engine.gradients import DenseGradient, GradientMask, weakly
 from sb3_sparse.engine.layers import SparseLayer, moments_of
 from sb3_sparse.engine.linear import CompactLinear
 from sb3_sparse.engine.masked import MaskedLayer
@@ -143,7 +144,7 @@ class CompactGradient(GradientMask):
     ) -> None:
         super().__init__(layer, capturing)
         self.functional = functional
-        self._arriving: th.Tensor | None = None
+        self._arriving: list[DenseGradient] = []
 
     def attach(self) -> Any:
         self.layer.module.listener = self
@@ -151,31 +152,37 @@ class CompactGradient(GradientMask):
         return weight.register_post_accumulate_grad_hook(weakly(self._arrived))
 
     def wanted(self) -> bool:
-        """Whether the next step moves the mask."""
+        """Whether the next step may move the mask."""
         return self.capturing() and not (self.functional and self.dense_grad is not None)
 
-    def note(self, dense_grad: th.Tensor) -> None:
-        """Take a dense gradient; several of one backward pass add up."""
+    def note(self, dense_grad: DenseGradient) -> None:
+        """Keep a dense gradient; several of one backward pass add up."""
         if self.functional:
             self.dense_grad = dense_grad
-        elif self._arriving is None:
-            self._arriving = dense_grad
         else:
-            self._arriving += dense_grad
+            self._arriving.append(dense_grad)
 
     def _arrived(self, weight: th.Tensor) -> None:
-        if self._arriving is None:
-            return
-        assert weight.grad is not None
-        self.dense_grad, self._arriving = self._arriving, None
-        # What is active may have been added to an earlier backward pass.
-        self.dense_grad.view(-1)[th.from_numpy(self.layer.module.structure.flat)] = weight.grad
+        if self._arriving:
+            assert weight.grad is not None
+            # What is active may have been added to an earlier backward pass.
+            active, flat = weight.grad.clone(), self.layer.module.structure.flat
+            self.dense_grad = partial(_added_up, self._arriving, active, th.from_numpy(flat))
+            self._arriving = []
 
-    def take(self) -> th.Tensor | None:
-        dense_grad = self.dense_grad
-        if self.layer.weight.grad is not None or not self.functional:
+    def take(self) -> DenseGradient | None:
+        dense_grad, stepping = self.dense_grad, self.layer.weight.grad is not None
+        if stepping or not self.functional:  # else it stays that of the rollout
             self.dense_grad = None
-        return None if self.layer.weight.grad is None and not self.functional else dense_grad
+        return dense_grad if stepping or self.functional else None
+
+
+def _added_up(parts: list[DenseGradient], active: th.Tensor, flat: th.Tensor) -> th.Tensor:
+    total = parts[0]()
+    for part in parts[1:]:
+        total += part()
+    total.view(-1)[flat] = active
+    return total
 
 
 def _carried(after: Structure, before: Structure) -> Callable[[th.Tensor], th.Tensor]:

@@ -209,10 +209,11 @@ class Controller:
         gradients = network.take_gradients(self._gradient_masks)
         if plan.due(network.clock, self.progress) or self._must_finish(network, plan):
             self.updates_due += 1
+            computed = {name: None if g is None else g() for name, g in gradients.items()}
             if plan.update_on == "step":
-                self._move(network, plan, gradients)
+                self._move(network, plan, computed)
             else:
-                network.pending = gradients
+                network.pending = computed
 
     def _after_load(self, optimizer: th.optim.Optimizer) -> None:
         for layer in self.layers:

@@ -26,6 +26,10 @@ if TYPE_CHECKING:
     from sb3_sparse.engine.masked import MaskedLayer
 
 
+DenseGradient = Callable[[], th.Tensor]
+"""Gives a dense gradient in the weight's shape; what it costs, it costs when it is called."""
+
+
 def weakly(hook: Any) -> Callable[[th.Tensor], Any]:
     """The hook without holding on to its object.
 
@@ -43,6 +47,10 @@ def weakly(hook: Any) -> Callable[[th.Tensor], Any]:
     return call
 
 
+def _kept(grad: th.Tensor) -> DenseGradient:
+    return lambda: grad
+
+
 class GradientMask(ABC):
     """Hook on the gradient of one layer.
 
@@ -53,14 +61,14 @@ class GradientMask(ABC):
     def __init__(self, layer: SparseLayer, capturing: Callable[[], bool]) -> None:
         self.layer = layer
         self.capturing = capturing
-        self.dense_grad: th.Tensor | None = None
+        self.dense_grad: DenseGradient | None = None
 
     @abstractmethod
     def attach(self) -> RemovableHandle:
         """Register the hook on the weight as it is now."""
 
     @abstractmethod
-    def take(self) -> th.Tensor | None:
+    def take(self) -> DenseGradient | None:
         """The dense gradient that the optimizer is about to apply, or None if there is none."""
 
 
@@ -79,11 +87,11 @@ class AccumulatedGradient(GradientMask):
         grad = weight.grad
         assert grad is not None
         if self.capturing():
-            self.dense_grad = grad.clone()
+            self.dense_grad = _kept(grad.clone())
         if layer.nnz != layer.size:
             grad.mul_(layer.float_mask)
 
-    def take(self) -> th.Tensor | None:
+    def take(self) -> DenseGradient | None:
         dense_grad, self.dense_grad = self.dense_grad, None
         return None if self.layer.weight.grad is None else dense_grad
 
@@ -102,10 +110,10 @@ class FunctionalGradient(GradientMask):
         full = layer.nnz == layer.size
         if self.dense_grad is None and not grad.requires_grad and self.capturing():
             # Where nothing is masked, the weight's gradient may become this very tensor.
-            self.dense_grad = grad.clone() if full else grad
+            self.dense_grad = _kept(grad.clone() if full else grad)
         return None if full else grad * layer.float_mask
 
-    def take(self) -> th.Tensor | None:
+    def take(self) -> DenseGradient | None:
         dense_grad = self.dense_grad
         if self.layer.weight.grad is not None:  # else it stays that of the rollout
             self.dense_grad = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Protocol
 
 import torch as th
@@ -20,10 +21,10 @@ class Listener(Protocol):
     """Wants a layer's dense gradient now and then."""
 
     def wanted(self) -> bool:
-        """Whether it is worth computing in this backward pass."""
+        """Whether to keep what it needs of this backward pass."""
 
-    def note(self, dense_grad: th.Tensor) -> None:
-        """Take it, in the weight's dense shape."""
+    def note(self, dense_grad: Callable[[], th.Tensor]) -> None:
+        """Take what computes it, in the weight's dense shape, from saved activations."""
 
 
 class CompactLinear(nn.Linear):

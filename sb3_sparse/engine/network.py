@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch as th
 from torch import nn
 
-from sb3_sparse.engine.gradients import GradientMask
+from sb3_sparse.engine.gradients import DenseGradient, GradientMask
 from sb3_sparse.engine.kernels import Kernel
 from sb3_sparse.engine.layers import SparseLayer
 from sb3_sparse.engine.masked import MaskedLayer
@@ -110,6 +110,6 @@ class SparseNetwork:
                 gain = gains[layer.name]
                 layer.set_weights(sparsity_aware_weights(mask, seed, layer.name, gain))
 
-    def take_gradients(self, masks: dict[str, GradientMask]) -> dict[str, th.Tensor | None]:
+    def take_gradients(self, masks: dict[str, GradientMask]) -> dict[str, DenseGradient | None]:
         """Dense gradients of the step that is about to happen, by layer name."""
         return {layer.name: masks[layer.name].take() for layer in self.layers}
