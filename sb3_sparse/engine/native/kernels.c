@@ -413,15 +413,33 @@ int NAMED(backward, SUFFIX)(const layer_t *layers, const batch_t *batch) {
     return 0;
 }
 
+/* WIDTH elements of x. */
+INLINE vec pick(const float *x, const int32_t *column) {
+#if WIDTH == 16
+    return (vec)_mm512_i32gather_ps(_mm512_loadu_si512(column), x, 4);
+#elif WIDTH == 8
+    return (vec)_mm256_i32gather_ps(x, _mm256_loadu_si256((const __m256i *)column), 4);
+#else
+    return (vec){x[column[0]], x[column[1]], x[column[2]], x[column[3]]};
+#endif
+}
+
 /* y = relu(W x + b) for one input. */
 void NAMED(single, SUFFIX)(const layer_t *layer, const float *x, float *y) {
     for (int64_t r = 0; r < layer->rows; r++) {
-        float sum[4] = {layer->bias ? layer->bias[r] : 0, 0, 0, 0};
+        vec even = {0}, odd = {0};
         int32_t k = layer->row_start[r], end = layer->row_start[r + 1];
-        for (; k + 4 <= end; k += 4)
-            for (int i = 0; i < 4; i++) sum[i] += layer->value[k + i] * x[layer->column[k + i]];
-        for (; k < end; k++) sum[0] += layer->value[k] * x[layer->column[k]];
-        float s = (sum[0] + sum[1]) + (sum[2] + sum[3]);
+        for (; k + 2 * WIDTH <= end; k += 2 * WIDTH) {
+            even += LOAD(layer->value + k) * pick(x, layer->column + k);
+            odd += LOAD(layer->value + k + WIDTH) * pick(x, layer->column + k + WIDTH);
+        }
+        if (k + WIDTH <= end) {
+            even += LOAD(layer->value + k) * pick(x, layer->column + k);
+            k += WIDTH;
+        }
+        float s = total(even + odd);
+        for (; k < end; k++) s += layer->value[k] * x[layer->column[k]];
+        if (layer->bias) s += layer->bias[r];
         y[r] = layer->relu && s < 0 ? 0 : s;
     }
 }
