@@ -213,12 +213,14 @@ class _Products(th.autograd.Function):
         how: _Pass = ctx.how
         x, work, _, *parameters = ctx.saved_tensors
         needs_x, *needs = ctx.needs_input_grad[1:]
+        pairs = list(zip((x, *parameters), (needs_x, *needs), strict=True))
         if th.is_grad_enabled():  # the gradient shall itself be differentiable; TRPO asks for it
-            pairs = list(zip((x, *parameters), (needs_x, *needs), strict=True))
             result = how.by_dense_weights(x, parameters)
             wanted = [tensor for tensor, need in pairs if need]
             found = iter(th.autograd.grad(result, wanted, gradients, create_graph=True))
             return None, *(next(found) if need else None for _, need in pairs)
+        if how.batch == 0:
+            return None, *(th.zeros_like(tensor) if need else None for tensor, need in pairs)
         grad = gradients[0].contiguous()
         arguments = list(ctx.arguments)
         grads: list[th.Tensor | None] = []

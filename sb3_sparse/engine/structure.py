@@ -11,7 +11,8 @@ from sb3_sparse.errors import CorruptStateError
 
 Int32 = NDArray[np.int32]
 Int64 = NDArray[np.int64]
-LIMIT = 2**31 - 1
+LIMIT = 2**31 - 65
+"""The kernels look up to a tile ahead with 32 bits."""
 
 
 class Structure:

@@ -166,6 +166,14 @@ def test_leading_dimensions_stay_and_a_single_vector_too():
         close(compact(x), dense(x))
 
 
+def test_an_empty_batch_has_gradients_of_zero():
+    _, compact = networks([5, 8, 3], ["some"], nn.Tanh, True, 0)
+    x = th.zeros(0, 5, requires_grad=True)
+    compact(x).sum().backward()
+    assert x.grad.shape == (0, 5)
+    assert not any(parameter.grad.any() for parameter in compact.parameters())
+
+
 def test_a_strided_input_is_taken_as_it_is():
     dense, compact = networks([5, 8, 3], ["some"], nn.ReLU, True, 0)
     x = th.randn(9, 10)[:, ::2]

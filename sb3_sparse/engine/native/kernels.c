@@ -336,6 +336,10 @@ void NAMED(forward, SUFFIX)(const layer_t *layers, const batch_t *batch) {
     run(forward_share, shares, split(layers, batch, shares));
 }
 
+static pthread_key_t at_exit;
+static pthread_once_t once = PTHREAD_ONCE_INIT;
+static void make_key(void) { pthread_key_create(&at_exit, free); }
+
 /* Memory of this thread that stays for the next call: new pages cost as much as the products.
    The address sanitizer gets exact sizes instead. */
 static float *scratch_of(size_t size) {
@@ -348,6 +352,8 @@ static float *scratch_of(size_t size) {
         free(kept);
         kept = aligned_alloc(64, size);
         kept_size = kept ? size : 0;
+        pthread_once(&once, make_key);
+        pthread_setspecific(at_exit, kept); /* freed with the thread */
     }
     return kept;
 }
