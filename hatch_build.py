@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import platform
+import shlex
 import shutil
 import subprocess
 import sys
@@ -35,7 +36,7 @@ AVX512 = [*AVX2, "-mavx512f", "-mavx512dq", "-mavx512vl", "-mavx512bw"]
 def compiler() -> list[str] | None:
     """The C compiler's command: ``CC``, else the first that is there."""
     if os.environ.get("CC"):
-        return os.environ["CC"].split()
+        return shlex.split(os.environ["CC"])
     found = next(filter(None, map(shutil.which, ("cc", "gcc", "clang"))), None)
     return None if found is None else [found]
 

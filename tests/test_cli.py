@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -68,6 +69,17 @@ def test_inspect_says_how_large_layers_compute_best(tmp_path, compute):
     line = r"critic\.qf1\.2 +(non-zeros|masked) +\d+\.\d{3} ms \(masked \d+\.\d{3} ms\)"
     assert re.search(line, done.stdout)
     assert ("was made with compute='sparse'" in done.stdout) == (compute == "sparse")
+
+
+def test_inspect_of_a_damaged_file_and_of_a_model_without_minibatches(tmp_path):
+    make("A2C", n_steps=6).save(tmp_path / "model")
+    done = sb3_sparse("inspect", "model.zip", cwd=tmp_path)
+    assert "On this machine compute='auto' keeps masks" in done.stdout, done.stderr
+    with zipfile.ZipFile(tmp_path / "half.zip", "w") as half:
+        half.writestr("_stable_baselines3_version", "2.9.2")
+    done = sb3_sparse("inspect", "half.zip", cwd=tmp_path)
+    assert done.returncode == 2
+    assert "half.zip is damaged" in done.stderr
 
 
 def test_a_killed_run_goes_on_from_its_last_evaluation(tmp_path):

@@ -81,6 +81,11 @@ class Choice:
             1e3 * sum(getattr(layer, kind) for layer in self.layers)
             for kind in ("masked_seconds", "chosen_seconds")
         )
+        if not self.compact:
+            return (
+                f"compute='auto' (batch {self.batch}): masks are quicker in all "
+                f"{len(self.layers)} layers measured ({masked:.2f} ms forward and backward)"
+            )
         threads = "1 thread" if self.threads == 1 else f"{self.threads} threads"
         return (
             f"compute='auto' (batch {self.batch}, {threads}): {len(self.compact)} of "
@@ -139,15 +144,15 @@ def _may_gain(run: Sequence[SparseLayer]) -> bool:
 
 def _choose_run(run: Sequence[SparseLayer], batch: int) -> list[LayerChoice]:
     timings = [timing_of((layer.shape[0], layer.shape[1]), layer.nnz, batch) for layer in run]
-    masked = [timing.masked for timing in timings]
-    best = masked
-    kinds: tuple[bool, ...] = (False,) * len(run)
-    combinations: Iterable[tuple[bool, ...]] = product((False, True), repeat=len(run))
+    kinds = tuple(layer.compact for layer in run)  # what is compact stays so
+    best = _seconds(run, timings, kinds)
+    enough = WORTH_CHANGING * sum(best)
+    combinations: Iterable[tuple[bool, ...]] = product(*((kind, True) for kind in kinds))
     if len(run) > LONGEST:
         combinations = [(True,) * len(run)]
     for combination in combinations:
         seconds = _seconds(run, timings, combination)
-        if sum(seconds) < min(sum(best), WORTH_CHANGING * sum(masked)):
+        if sum(seconds) < min(sum(best), enough):
             best, kinds = seconds, combination
     return [
         LayerChoice(layer.name, compact, timing.masked, seconds)

@@ -22,10 +22,23 @@ from sb3_sparse.errors import UnsupportedError
 if TYPE_CHECKING:
     from sb3_sparse.engine.linear import CompactLinear
 
+PLAIN = (th.Tensor, th.nn.Parameter)
 TILE = 64
 FIELDS = 14
 VALUE_GRAD, BIAS_GRAD, OUTPUT_GRAD = 11, 12, 13
 """Places of a layer's fields in ``layer_t`` of ``kernels.h`` that only the way back fills."""
+
+
+# Whatever torch's defaults are: the kernels read and write this and nothing else.
+_empty = partial(th.empty, dtype=th.float32, device="cpu")
+
+
+def _tiles(batch: int, features: int) -> th.Tensor:
+    """Room for a batch in tiles; what fills up the last one is 0, lest somebody looks at it."""
+    tiles = _empty(tiles_of(batch), features, TILE)
+    if batch % TILE:
+        tiles[-1].zero_()
+    return tiles
 
 
 def tiles_of(batch: int) -> int:
@@ -59,7 +72,7 @@ class Chain:
 
         :raises UnsupportedError: for anything but float32 in main memory, ``columns`` wide
         """
-        if x.dtype != th.float32 or x.device.type != "cpu" or x.shape[-1] != self.columns:
+        if x.dtype != th.float32 or x.device.type != "cpu" or x.shape[-1:] != (self.columns,):
             raise UnsupportedError(
                 f"a layer that computes on non-zeros takes float32 on the CPU with "
                 f"{self.columns} features, got {x.dtype} on {x.device} of shape {tuple(x.shape)}; "
@@ -77,6 +90,8 @@ class Chain:
             structures.append(structure)
             parameters += [values, layer.bias]
         how = _Pass(self.relus, structures, self._references, batch, tiled_in, tiled_out)
+        if type(x) not in PLAIN or th._C._get_tracing_state() is not None:
+            return how.by_dense_weights(x, parameters)  # somebody wants the graph of operations
         if th.is_grad_enabled() and (
             x.requires_grad or any(p is not None and p.requires_grad for p in parameters)
         ):
@@ -109,12 +124,19 @@ class _Pass(NamedTuple):
         """``layer_t`` of every layer, without the gradients."""
         arguments: list[int] = []
         for i, structure in enumerate(self.structures):
-            bias = parameters[2 * i + 1]
+            values, bias = parameters[2 * i : 2 * i + 2]
+            for parameter in (values, bias):
+                if parameter is not None and not _readable(parameter):
+                    raise UnsupportedError(
+                        "weights and biases of layers that compute on non-zeros must be "
+                        f"contiguous float32 on the CPU, got {parameter.dtype} on "
+                        f"{parameter.device} with strides {parameter.stride()}"
+                    )
             arguments += (
                 *structure.shape,
                 self.relus[i],
                 *structure.addresses,
-                parameters[2 * i].data_ptr(),
+                values.data_ptr(),
                 0 if bias is None else bias.data_ptr(),
                 outputs[i],
                 0,
@@ -125,8 +147,8 @@ class _Pass(NamedTuple):
 
     def single(self, x: th.Tensor, parameters: Sequence[Any]) -> th.Tensor:
         """One input, row by row; nothing is kept."""
-        y = th.empty(1, self.rows)
-        spare = th.empty(2 * max(structure.shape[0] for structure in self.structures))
+        y = _empty(1, self.rows)
+        spare = _empty(2 * max(structure.shape[0] for structure in self.structures))
         arguments = self.arguments(parameters, [0] * len(self.structures))
         library().sb3_sparse_single(
             (ctypes.c_int64 * len(arguments))(*arguments),
@@ -143,8 +165,8 @@ class _Pass(NamedTuple):
         """Result, workspace with all activations in tiles (but a tiled result), and arguments."""
         tiles = tiles_of(self.batch)
         widths = self._widths()
-        y = th.empty((tiles, self.rows, TILE) if self.tiled_out else (self.batch, self.rows))
-        work = th.empty(tiles * TILE * sum(widths))
+        y = _tiles(self.batch, self.rows) if self.tiled_out else _empty(self.batch, self.rows)
+        work = _empty(tiles * TILE * sum(widths))
         start = at = work.data_ptr()
         places = []
         for width in widths:
@@ -187,7 +209,8 @@ class _Pass(NamedTuple):
         for i, structure in enumerate(self.structures):
             rows, columns = structure.shape
             flat = th.from_numpy(structure.flat)
-            weight = th.zeros(rows * columns).index_put((flat,), parameters[2 * i])
+            values = parameters[2 * i]
+            weight = values.new_zeros(rows * columns).index_put((flat,), values)
             x = functional.linear(x, weight.view(rows, columns), parameters[2 * i + 1])
             if self.relus[i]:
                 x = functional.relu(x)
@@ -197,6 +220,14 @@ class _Pass(NamedTuple):
         return x
 
 
+def _readable(parameter: th.Tensor) -> bool:
+    return (
+        parameter.dtype == th.float32
+        and parameter.device.type == "cpu"
+        and parameter.is_contiguous()
+    )
+
+
 class _Products(th.autograd.Function):
     """A chain on a batch, differentiable by its input, values and biases."""
 
@@ -204,8 +235,10 @@ class _Products(th.autograd.Function):
     def forward(ctx: Any, how: _Pass, x: th.Tensor, *parameters: Any) -> th.Tensor:
         y, work, arguments = how.forward(x, parameters)
         ctx.how, ctx.arguments = how, arguments
-        # What is tiled goes into the way back, so it is kept as well.
-        ctx.save_for_backward(x, work, y if how.tiled_out else None, *parameters)
+        # A tiled result is looked at on the way back where a ReLU made it. Where none did, an
+        # activation that works in place may change it.
+        kept = y if how.tiled_out and how.relus[-1] else None
+        ctx.save_for_backward(x, work, kept, *parameters)
         return y
 
     @staticmethod
@@ -219,6 +252,11 @@ class _Products(th.autograd.Function):
             wanted = [tensor for tensor, need in pairs if need]
             found = iter(th.autograd.grad(result, wanted, gradients, create_graph=True))
             return None, *(next(found) if need else None for _, need in pairs)
+        for structure, values in zip(how.structures, parameters[::2], strict=True):
+            if values.numel() != structure.nnz:
+                raise RuntimeError(
+                    "a layer's connections have changed between its forward and its backward pass"
+                )
         if how.batch == 0:
             return None, *(th.zeros_like(tensor) if need else None for tensor, need in pairs)
         grad = gradients[0].contiguous()
@@ -234,10 +272,12 @@ class _Products(th.autograd.Function):
         for i, reference in enumerate(how.layers):
             listener = None if (layer := reference()) is None else layer.listener
             if needs[2 * i] and listener is not None and listener.wanted():
-                left = th.empty(tiles_of(how.batch), how.structures[i].shape[0], TILE)
+                left = _empty(tiles_of(how.batch), how.structures[i].shape[0], TILE)
                 arguments[FIELDS * i + OUTPUT_GRAD] = left.data_ptr()
                 listening.append((i, listener, left))
-        grad_x = th.empty_like(x) if needs_x else None
+        grad_x = None
+        if needs_x:
+            grad_x = _tiles(how.batch, how.columns) if how.tiled_in else th.empty_like(x)
         to = 0 if grad_x is None else grad_x.data_ptr()
         argument = BatchArgument(
             layers=len(how.structures),
@@ -262,7 +302,7 @@ class _Products(th.autograd.Function):
 
 def _outer(output_grad: th.Tensor, x: th.Tensor, batch: int) -> th.Tensor:
     """Dense gradient of a layer's weight, from tiles of its output's gradient and its input."""
-    total = th.zeros(output_grad.shape[1], x.shape[1])
+    total = x.new_zeros(output_grad.shape[1], x.shape[1])
     for t in range(len(x)):
         entries = min(TILE, batch - t * TILE)
         total.addmm_(output_grad[t, :, :entries], x[t, :, :entries].T)

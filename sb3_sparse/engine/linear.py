@@ -66,12 +66,7 @@ class CompactLinear(nn.Linear):
         return Chain([self], [False])(input)
 
     def _apply(self, fn: Any, recurse: bool = True) -> Any:
-        probe = fn(th.empty(0))
-        if probe.device.type != "cpu" or probe.dtype != th.float32:
-            raise UnsupportedError(
-                f"layers that compute on non-zeros stay float32 on the CPU, and cannot become "
-                f"{probe.dtype} on {probe.device}; make the policy with compute='masked'"
-            )
+        check_conversion(fn)
         return super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
 
     def live(self) -> tuple[Structure, th.Tensor]:
@@ -85,7 +80,7 @@ class CompactLinear(nn.Linear):
     def dense(self) -> th.Tensor:
         """The weights, 0 where inactive, shape ``(rows, columns)``."""
         structure, values = self.live()
-        weight = th.zeros(structure.shape[0] * structure.shape[1])
+        weight = values.detach().new_zeros(structure.shape[0] * structure.shape[1])
         weight[th.from_numpy(structure.flat)] = values.detach()
         return weight.view(structure.shape)
 
@@ -106,7 +101,7 @@ class CompactLinear(nn.Linear):
         current, values = self.live()
         self.snapshot = (current, values.detach().clone())
         self.structure = structure
-        replace_data(self.weight, th.full((structure.nnz,), AWAITING))
+        replace_data(self.weight, self.weight.new_full((structure.nnz,), AWAITING))
 
     def _take(self, dense: th.Tensor) -> None:
         """Take dense weights; a target's that lie outside the structure make a snapshot."""
@@ -115,7 +110,7 @@ class CompactLinear(nn.Linear):
         if self.is_target:
             own = Structure.of_mask(flat.numpy() != 0, self.structure.shape)
             if (own.places_in(self.structure) < 0).any():
-                replace_data(self.weight, th.full((self.structure.nnz,), AWAITING))
+                replace_data(self.weight, dense.new_full((self.structure.nnz,), AWAITING))
                 self.snapshot = (own, flat[th.from_numpy(own.flat)])
                 return
         self.restructure(self.structure, values)
@@ -146,12 +141,26 @@ class CompactLinear(nn.Linear):
                 raise CorruptStateError(f"the mask of {prefix}weight has no connection")
             self.structure = Structure.of_mask(mask.cpu().numpy(), self.structure.shape)
             if weight is None:
-                self.restructure(self.structure, th.zeros(self.structure.nnz))
+                self.restructure(self.structure, self.weight.new_zeros(self.structure.nnz))
         if weight is not None:
             self._take(weight.to(device="cpu", dtype=th.float32))
             state_dict[prefix + "weight"] = self.weight.detach().clone()
         super()._load_from_state_dict(
             state_dict, prefix, local_metadata, strict, missing_keys, unexpected_keys, error_msgs
+        )
+
+
+def check_conversion(fn: Callable[[th.Tensor], th.Tensor]) -> None:
+    """Refuse what would make a compact layer anything but float32 on the CPU.
+
+    :param fn: what torch is about to apply to every parameter and buffer
+    :raises UnsupportedError: if it changes type or device
+    """
+    probe = fn(th.empty(0, dtype=th.float32, device="cpu"))
+    if probe.device.type != "cpu" or probe.dtype != th.float32:
+        raise UnsupportedError(
+            "layers that compute on non-zeros stay float32 on the CPU, and cannot become "
+            f"{probe.dtype} on {probe.device}; make the policy with compute='masked'"
         )
 
 
@@ -164,5 +173,5 @@ def replace_data(parameter: nn.Parameter, data: th.Tensor) -> None:
     # While a graph of earlier passes is alive, autograd goes on to expect gradients of the old
     # size. A change of type makes it forget.
     parameter.grad = None
-    parameter.data = th.empty(0, dtype=th.float64)
+    parameter.data = parameter.new_empty(0, dtype=th.float64)
     parameter.data = data

@@ -7,6 +7,7 @@ from typing import Any
 
 import torch as th
 from torch import nn
+from torch.nn.modules.module import _has_any_global_hook
 
 from sb3_sparse.engine.chains import Chain
 from sb3_sparse.engine.linear import CompactLinear
@@ -47,7 +48,8 @@ class ChainedSequential(nn.Sequential):
     def forward(self, input: th.Tensor) -> th.Tensor:
         """As of ``Sequential``."""
         modules = tuple(self._modules.values())
-        if any(getattr(module, hooks) for module in modules for hooks in HOOKS):
+        hooked = any(getattr(module, hooks) for module in modules for hooks in HOOKS)
+        if hooked or _has_any_global_hook():  # type: ignore[no-untyped-call]
             y: th.Tensor = super().forward(input)  # type: ignore[no-untyped-call]
             return y
         if modules != self._seen:
@@ -96,6 +98,8 @@ def _steps(modules: Sequence[Any]) -> list[tuple[Any, bool, bool]]:
 def chain_up(root: nn.Module) -> None:
     """Let every ``Sequential`` below ``root`` run its compact layers as chains."""
     for module in root.modules():
-        if type(module) is nn.Sequential and any(isinstance(m, CompactLinear) for m in module):
+        if type(module) not in (nn.Sequential, ChainedSequential):
+            continue
+        if any(isinstance(child, CompactLinear) for child in module.children()):
             module.__class__ = ChainedSequential
-            vars(module).update(_seen=(), _steps=[])
+            vars(module).update(_seen=(), _steps=[])  # more of them may be compact now

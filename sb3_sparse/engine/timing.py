@@ -10,7 +10,6 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
-from statistics import median
 from typing import Any
 
 import numpy as np
@@ -120,7 +119,7 @@ def _step(
 
 
 def _interleaved(steps: list[Callable[[], None]]) -> list[float]:
-    """Median seconds of each step, timed in turn so that a busy machine slows all of them."""
+    """Least seconds of each step, timed in turn: what a busy machine adds decides nothing."""
     repeats = []
     for step in steps:
         step()
@@ -134,7 +133,7 @@ def _interleaved(steps: list[Callable[[], None]]) -> list[float]:
             for _ in range(count):
                 step()
             found.append((time.perf_counter() - start) / count)
-    return [median(found) for found in times]
+    return [min(found) for found in times]
 
 
 @cache
@@ -158,17 +157,17 @@ def _read() -> dict[str, Timing]:
     try:
         found: dict[str, Any] = json.loads(cache_path().read_text())
         return {key: Timing(**{k: float(v) for k, v in t.items()}) for key, t in found.items()}
-    except (OSError, ValueError, TypeError, AttributeError):
+    except (OSError, RuntimeError, ValueError, TypeError, AttributeError):
         return {}  # there is none, or it is damaged: measured again and written anew
 
 
 def _write() -> None:
-    path = cache_path()
     whole = {**_read(), **_known}
     try:
+        path = cache_path()
         path.parent.mkdir(parents=True, exist_ok=True)
         draft = path.with_name(f"{path.name}.{os.getpid()}")
         draft.write_text(json.dumps({key: asdict(timing) for key, timing in whole.items()}))
         draft.replace(path)
-    except OSError:
-        pass  # a home that cannot be written to: measured again next time
+    except (OSError, RuntimeError):
+        pass  # no home, or one that cannot be written to: measured again next time

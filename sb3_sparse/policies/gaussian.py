@@ -13,6 +13,7 @@ from typing import Any
 import torch as th
 from stable_baselines3.common.distributions import SquashedDiagGaussianDistribution
 from torch import nn
+from torch.autograd.function import once_differentiable
 
 LOG_OF_ROOT_OF_TWO_PI = 0.5 * math.log(2.0 * math.pi)
 
@@ -40,6 +41,7 @@ class _SampleAndLogProb(th.autograd.Function):
         return action, log_prob, gaussian
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, *gradients: Any) -> Any:
         grad_action, grad_log_prob, _ = gradients
         action, slope, inside, spread = ctx.saved_tensors
@@ -61,7 +63,16 @@ class QuickSquashedGaussian(SquashedDiagGaussianDistribution):
         )
         if log_prob.isnan().any():  # SB3 says what is wrong
             return super().log_prob_from_params(mean_actions, log_std)
+        self._mean, self._log_std = mean_actions, log_std
+        vars(self).pop("distribution", None)  # of other observations
         return action, log_prob
+
+    def __getattr__(self, name: str) -> Any:
+        # Made when somebody asks for it, which training does not.
+        if name != "distribution" or "_mean" not in vars(self):
+            raise AttributeError(name)
+        self.proba_distribution(self._mean, self._log_std)
+        return vars(self)["distribution"]
 
 
 def quicken(actor: nn.Module) -> None:

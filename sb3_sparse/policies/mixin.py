@@ -16,6 +16,7 @@ from stable_baselines3.common.type_aliases import Schedule
 
 from sb3_sparse.engine.auto import AutoCompute
 from sb3_sparse.engine.controller import Controller
+from sb3_sparse.engine.linear import check_conversion
 from sb3_sparse.engine.optimizers import check_weight_decay, rebuild
 from sb3_sparse.errors import CorruptStateError
 from sb3_sparse.policies.build import build_networks
@@ -122,6 +123,12 @@ class SparsePolicyMixin(BasePolicy):
         twin.__dict__.update(copy.deepcopy(self.__dict__, memo))
         twin.sparse.attach()
         return twin
+
+    def _apply(self, fn: Any, recurse: bool = True) -> Any:
+        sparse = vars(self).get("sparse")  # SB3 moves parts before the whole is there
+        if sparse is not None and any(layer.compact for layer in sparse.layers):
+            check_conversion(fn)  # before anything has changed
+        return super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)  # type: ignore[no-untyped-call]

@@ -21,18 +21,15 @@ class Inspection:
     """What a saved model is.
 
     :param report: its layers
-    :param choice: what ``compute="auto"`` would choose on this machine; None if the model was not
-        trained in minibatches of one size
+    :param choice: what ``compute="auto"`` would choose on this machine
     :param compute: what it was made with
     """
 
     report: SparsityReport
-    choice: Choice | None
+    choice: Choice
     compute: str
 
     def __str__(self) -> str:
-        if self.choice is None:
-            return str(self.report)
         parts = [str(self.report), "", f"On this machine {self.choice}"]
         if self.choice.layers:
             parts.append(self.choice.table())
@@ -54,12 +51,12 @@ def _load(path: Path) -> tuple[SparsePolicyMixin, dict[str, Any]]:
         data, params, _ = load_from_zip_file(path, device="cpu")
     except (BadZipFile, ValueError) as error:
         raise ConfigError(f"{path} is no model saved by SB3: {error}") from error
-    policy_class = (data or {}).get("policy_class")
+    if data is None or "policy" not in params:
+        raise ConfigError(f"{path} is damaged: it has no data or no policy in it")
+    policy_class = data.get("policy_class")
     if not (isinstance(policy_class, type) and issubclass(policy_class, SparsePolicyMixin)):
         name = getattr(policy_class, "__name__", "none")
         raise ConfigError(f"the policy in {path} is not sparse but {name}")
-    assert data is not None
-    assert params is not None
     kwargs = {**data["policy_kwargs"], "compute": "masked"}  # which every machine can
     if data["use_sde"]:
         kwargs["use_sde"] = True
@@ -74,10 +71,10 @@ def _load(path: Path) -> tuple[SparsePolicyMixin, dict[str, Any]]:
 def inspect_model(path: Path) -> Inspection:
     """The sparsity report of a saved model, and how its layers would best be computed here."""
     policy, data = _load(path)
-    batch = data.get("batch_size")
+    batch = data.get("batch_size") or data["n_steps"] * data["n_envs"]  # A2C: the whole rollout
     use_few_threads(policy.observation_space)
     return Inspection(
         report=policy.sparsity_report(),
-        choice=choose(policy, list(policy.sparse.layers), batch) if batch else None,
+        choice=choose(policy, list(policy.sparse.layers), batch),
         compute=data["policy_kwargs"].get("compute", "auto"),
     )

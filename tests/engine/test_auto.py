@@ -11,6 +11,7 @@ from torch import nn
 from sb3_sparse import SparsityCallback
 from sb3_sparse.engine import auto, timing
 from sb3_sparse.engine.auto import AutoCompute, choose, runs_of
+from sb3_sparse.engine.compact import CompactLayer
 from sb3_sparse.engine.masked import MaskedLayer
 from sb3_sparse.engine.native import library
 from sb3_sparse.engine.timing import Timing
@@ -99,7 +100,7 @@ def test_missing_kernels_keep_masks_and_say_why(monkeypatch, tmp_path):
     reason = choose(root, layers_of(root), 8).reason
     library.library.cache_clear()
     assert reason is not None
-    assert "no C compiler when sb3-sparse was installed" in reason
+    assert "were not compiled when sb3-sparse was installed" in reason
 
 
 def test_timings_are_measured_once_and_remembered_in_a_file(monkeypatch, tmp_path):
@@ -124,6 +125,37 @@ def test_a_damaged_cache_is_measured_anew(monkeypatch, tmp_path):
     timing.cache_path().write_text("{half")
     assert timing.timing_of((4, 3), 5, 7).masked > 0
     assert len(json.loads(timing.cache_path().read_text())) == 1
+
+
+def test_without_a_home_timings_are_measured_all_the_same(monkeypatch):
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr(timing, "_known", {})
+
+    def nowhere() -> None:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.setattr(timing.Path, "home", nowhere)
+    assert timing.timing_of((4, 3), 5, 7).masked > 0
+
+
+def test_what_is_compact_stays_so_in_later_choices(timings):
+    root = nn.Sequential(nn.Linear(2, 3), nn.ReLU(), nn.Linear(3, 4))
+    layers = layers_of(root)
+    layers[0] = CompactLayer(layers[0])
+    timings.update({(3, 2): Timing(1.0, 2.0, 0.1), (4, 3): Timing(1.0, 0.2, 0.1)})
+    choice = choose(root, layers, 8)
+    assert choice.compact == ("0", "2")
+    timings[(4, 3)] = Timing(1.0, 2.0, 0.1)
+    assert choose(root, layers, 8).compact == ("0",)
+
+
+def test_masks_that_are_quicker_everywhere_are_said_so(timings):
+    root = nn.Sequential(nn.Linear(2, 3))
+    timings[(3, 2)] = Timing(0.001, 0.002, 0.001)
+    assert str(choose(root, layers_of(root), 8)) == (
+        "compute='auto' (batch 8): masks are quicker in all 1 layers measured (1.00 ms forward and "
+        "backward)"
+    )
 
 
 def model_on_auto(monkeypatch, quicker: bool, **policy_kwargs):

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import copy
+from functools import partial
+
 import numpy as np
 import pytest
 import torch as th
@@ -180,7 +183,11 @@ def test_a_strided_input_is_taken_as_it_is():
     close(compact(x), dense(x))
 
 
-@pytest.mark.parametrize("x", [th.zeros(4, 6), th.zeros(4, 5, dtype=th.float64)])
+@pytest.mark.parametrize(
+    "x",
+    [th.zeros(4, 6), th.zeros(4, 5, dtype=th.float64), th.zeros(())],
+    ids=["wide", "double", "0d"],
+)
 def test_what_the_kernels_cannot_read_is_refused(x):
     _, compact = networks([5, 8, 3], ["some"], nn.ReLU, True, 0)
     with pytest.raises(UnsupportedError, match="takes float32 on the CPU with 5 features"):
@@ -258,6 +265,82 @@ def test_modules_that_look_at_whole_rows_get_rows():
         chained(compact[0], norm, compact[1], compact[2])(x),
         nn.Sequential(dense[0], norm, dense[1], dense[2])(x),
     )
+
+
+@pytest.mark.parametrize("activation", [nn.ELU, nn.LeakyReLU, nn.ReLU, nn.SELU])
+def test_activations_may_work_in_place(activation):
+    compare(*networks([5, 8, 7, 3], ["some"], partial(activation, inplace=True), True, 0), 70)
+
+
+def test_a_traced_network_is_the_network():
+    dense, compact = networks([5, 8, 3], ["some"], nn.Tanh, True, 0)
+    with th.no_grad():
+        traced = th.jit.trace(compact, th.randn(2, 5))
+    x = th.randn(7, 5)
+    close(traced(x), dense(x))
+
+
+def test_torchs_defaults_change_nothing():
+    dense, compact = networks([5, 8, 3], ["some"], nn.Tanh, True, 0)
+    x = th.randn(7, 5)
+    expected = dense(x)
+    th.set_default_dtype(th.float64)
+    try:
+        with th.device("meta"):
+            y = compact(x)
+            y.sum().backward()
+    finally:
+        th.set_default_dtype(th.float32)
+    close(y, expected)
+    assert compact[0].weight.grad.dtype == th.float32
+
+
+def test_connections_that_change_between_the_passes_are_noticed():
+    _, compact = networks([5, 8, 3], ["full"], nn.ReLU, True, 0)
+    y = compact(th.randn(7, 5))
+    compact[0].restructure(Structure(np.arange(4), (8, 5)), th.ones(4))
+    with pytest.raises(RuntimeError, match="connections have changed between"):
+        y.sum().backward()
+
+
+def test_layers_that_become_compact_later_join_the_chain():
+    dense, _ = networks([5, 8, 7, 3], ["some"], nn.ReLU, True, 0)
+    sequence = copy.deepcopy(dense)
+    x = th.randn(70, 5)
+    for i in (2, 0, 4):
+        mask = dense[i].mask
+        CompactLinear.convert(sequence[i], Structure.of_mask(mask, mask.shape), is_target=False)
+        chain_up(sequence)
+        close(sequence(x), dense(x))
+    assert len(sequence._steps) == 1
+
+
+def test_no_nan_is_seen_where_there_is_none():
+    _, compact = networks([5, 8, 3], ["some"], nn.Tanh, True, 0)
+    th.use_deterministic_algorithms(True)  # fills what is not written with NaN
+    try:
+        with th.autograd.detect_anomaly(check_nan=True):
+            compact(th.randn(100, 5)).sum().backward()
+    finally:
+        th.use_deterministic_algorithms(False)
+
+
+def test_what_is_hooked_everywhere_is_called_by_itself():
+    dense, compact = networks([5, 8, 3], ["some"], nn.ReLU, True, 0)
+    shapes = []
+    handle = nn.modules.module.register_module_forward_hook(
+        lambda module, inputs, y: shapes.append(tuple(y.shape))
+    )
+    compact(th.randn(7, 5))
+    handle.remove()
+    assert shapes == [(7, 8), (7, 8), (7, 3), (7, 3)]
+
+
+def test_weights_that_the_kernels_cannot_read_are_refused():
+    _, compact = networks([5, 8, 3], ["some"], nn.ReLU, True, 0)
+    compact[0].bias.data = th.zeros(16)[::2]
+    with pytest.raises(UnsupportedError, match="must be contiguous float32"):
+        compact(th.randn(7, 5))
 
 
 def chained(*modules: nn.Module) -> nn.Sequential:

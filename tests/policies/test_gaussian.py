@@ -69,3 +69,22 @@ def test_what_is_not_a_number_is_reported_as_in_sb3():
 def test_a_model_can_be_copied_right_after_training():
     model = make("SAC").learn(25)
     copy.deepcopy(model.policy)
+
+
+def test_the_distribution_is_that_of_the_last_observations():
+    distribution = QuickSquashedGaussian(2)
+    distribution.log_prob_from_params(th.zeros(5, 2), th.zeros(5, 2))
+    mean = th.full((3, 2), 0.5)
+    distribution.log_prob_from_params(mean, th.zeros(3, 2))
+    np.testing.assert_allclose(distribution.mode(), np.tanh(mean))
+    assert distribution.sample().shape == (3, 2)
+    with pytest.raises(AttributeError):
+        QuickSquashedGaussian(2).sample()
+
+
+def test_second_derivatives_are_refused():
+    mean = th.zeros(3, 2, requires_grad=True)
+    _, log_prob = QuickSquashedGaussian(2).log_prob_from_params(mean, th.zeros(3, 2))
+    (first,) = th.autograd.grad(log_prob.sum(), mean, create_graph=True)
+    with pytest.raises(RuntimeError, match="does not require grad|once_differentiable"):
+        first.sum().backward()

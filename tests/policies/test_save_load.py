@@ -16,7 +16,7 @@ import torch as th
 from support import ALGORITHMS, assert_masked, make
 
 from sb3_sparse import SparsityCallback
-from sb3_sparse.errors import CorruptStateError
+from sb3_sparse.errors import CorruptStateError, UnsupportedError
 from sb3_sparse.policies.mixin import SparsePolicyMixin
 
 NAMES = sorted(ALGORITHMS)
@@ -291,3 +291,11 @@ def test_copies_and_pickles_save_moments_in_the_common_form():
                 for key, value in state.items():
                     np.testing.assert_array_equal(other.state_dict()["state"][number][key], value)
                     assert value.dim() != 1 or value.shape[0] in (24, 1)  # biases only
+
+
+def test_a_policy_that_cannot_change_its_type_does_not_change_in_part():
+    policy = make("SAC", policy_kwargs=dict(compute="sparse", dense_layers=["input"])).policy
+    with pytest.raises(UnsupportedError, match="stay float32 on the CPU"):
+        policy.double()
+    assert {p.dtype for p in policy.parameters()} == {th.float32}
+    assert policy.to("cpu") is policy

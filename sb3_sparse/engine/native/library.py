@@ -42,7 +42,9 @@ def library() -> ctypes.CDLL:
     if ctypes.sizeof(ctypes.c_void_p) != 8:
         raise MissingKernels("this is a 32-bit Python")
     if not PATH.exists():
-        raise MissingKernels("there was no C compiler when sb3-sparse was installed")
+        raise MissingKernels(
+            "they were not compiled when sb3-sparse was installed (no C compiler, or it failed)"
+        )
     try:
         found = ctypes.CDLL(str(PATH))
         version = found.sb3_sparse_version()
