@@ -78,6 +78,14 @@ def test_an_unknown_way_to_compute_is_refused():
         make("SAC", policy_kwargs=dict(compute="dense"))
 
 
+def test_the_kernels_share_torchs_threads_where_torch_has_openmp():
+    import torch as th
+
+    if not list(Path(th.__file__).parent.glob("lib/libgomp*")):
+        pytest.skip("this torch brings no libgomp")
+    assert library.library().sb3_sparse_shares_threads() == 1
+
+
 def built_wheel(folder: Path, **environment: str) -> tuple[str, list[str], str]:
     """Name and files of a wheel built in a copy of the sources, and what was said."""
     source = folder / "source"

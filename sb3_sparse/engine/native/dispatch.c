@@ -51,6 +51,18 @@ static int runs_here(const kernels_t *kernels) {
 /* Changes with every change of what Python hands over. */
 EXPORT int sb3_sparse_version(void) { return 1; }
 
+openmp_t sb3_sparse_openmp;
+
+/* Share these threads from now on; without them there is one. */
+EXPORT void sb3_sparse_share_threads(void *parallel, void *thread, void *threads) {
+    memcpy(&sb3_sparse_openmp.parallel, &parallel, sizeof parallel);
+    memcpy(&sb3_sparse_openmp.thread, &thread, sizeof thread);
+    memcpy(&sb3_sparse_openmp.threads, &threads, sizeof threads);
+}
+
+/* 1 where there is more than one thread to be had. */
+EXPORT int sb3_sparse_shares_threads(void) { return sb3_sparse_openmp.parallel != 0; }
+
 /* Name of the i-th instruction set that runs here, the best first; NULL where there are no more. */
 EXPORT const char *sb3_sparse_instructions(int i) {
     for (int k = 0; k < COUNT; k++)

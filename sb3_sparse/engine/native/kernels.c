@@ -235,8 +235,7 @@ static int64_t vectors_of(const batch_t *batch, int64_t tile) {
     return (entries_of(batch, tile) + WIDTH - 1) / WIDTH;
 }
 
-static void *forward_share(void *argument) {
-    const share_t *share = argument;
+static void forward_share(share_t *share) {
     const batch_t *batch = share->batch;
     const layer_t *layers = share->layers, *last = layers + batch->layers - 1;
     for (int64_t t = share->first; t < share->last; t++) {
@@ -253,11 +252,9 @@ static void *forward_share(void *argument) {
         if (batch->rows_out)
             from_tile(x, entries, last->rows, batch->rows_out + t * TILE * last->rows);
     }
-    return 0;
 }
 
-static void *backward_share(void *argument) {
-    const share_t *share = argument;
+static void backward_share(share_t *share) {
     const batch_t *batch = share->batch;
     const layer_t *layers = share->layers, *top = layers + batch->layers - 1;
     int64_t first = share->first, last = share->last;
@@ -290,7 +287,7 @@ static void *backward_share(void *argument) {
             if (layer->output_grad)
                 memcpy(layer->output_grad + t * out, from, out * sizeof *from);
         }
-        if (l == 0 && !batch->rows_input_grad && !batch->tiles_input_grad) return 0;
+        if (l == 0 && !batch->rows_input_grad && !batch->tiles_input_grad) return;
         float *next = g == share->scratch[0] ? share->scratch[1] : share->scratch[0];
         if (l == 0 && batch->tiles_input_grad) next = batch->tiles_input_grad + first * into;
         for (int64_t t = first; t < last; t++)
@@ -302,22 +299,26 @@ static void *backward_share(void *argument) {
     for (int64_t t = first; t < last && batch->rows_input_grad; t++)
         from_tile(g + (t - first) * layers->columns * TILE, entries_of(batch, t), layers->columns,
                   batch->rows_input_grad + t * TILE * layers->columns);
-    return 0;
 }
 
-/* Run the shares, the first one here. A thread that cannot be had is done here too. */
-static void run(void *(*work)(void *), share_t *shares, int64_t count) {
-    pthread_t threads[64];
-    int started[64] = {0};
-    for (int64_t i = 1; i < count; i++)
-        started[i] = pthread_create(threads + i, 0, work, shares + i) == 0;
-    work(shares);
-    for (int64_t i = 1; i < count; i++) {
-        if (started[i])
-            pthread_join(threads[i], 0);
-        else
-            work(shares + i);
-    }
+typedef struct {
+    void (*work)(share_t *);
+    share_t *shares;
+    int64_t count;
+} job_t;
+
+static void take_shares(void *argument) {
+    const job_t *job = argument;
+    for (int64_t i = sb3_sparse_openmp.thread(); i < job->count; i += sb3_sparse_openmp.threads())
+        job->work(job->shares + i);
+}
+
+static void run(void (*work)(share_t *), share_t *shares, int64_t count) {
+    job_t job = {work, shares, count};
+    if (count > 1 && sb3_sparse_openmp.parallel)
+        sb3_sparse_openmp.parallel(take_shares, &job, (unsigned)count, 0);
+    else
+        for (int64_t i = 0; i < count; i++) work(shares + i);
 }
 
 static int64_t split(const layer_t *layers, const batch_t *batch, share_t *shares) {

@@ -47,6 +47,15 @@ typedef struct {
     float *tiles_input_grad; /* the same in tiles, or NULL */
 } batch_t;
 
+/* OpenMP as the process has it already: GOMP_parallel, omp_get_thread_num, omp_get_num_threads.
+   A second pool of threads would fight with the one that waits, spinning, for torch's next call. */
+typedef struct {
+    void (*parallel)(void (*)(void *), void *, unsigned, unsigned);
+    int (*thread)(void);
+    int (*threads)(void);
+} openmp_t;
+extern openmp_t sb3_sparse_openmp;
+
 #define JOIN(name, suffix) name##_##suffix
 #define NAMED(name, suffix) JOIN(name, suffix)
 

@@ -6,6 +6,8 @@ import ctypes
 from functools import cache
 from pathlib import Path
 
+import torch as th
+
 from sb3_sparse.errors import ConfigError, MissingKernels
 
 PATH = Path(__file__).with_name("kernels.so")
@@ -61,7 +63,21 @@ def library() -> ctypes.CDLL:
         ctypes.c_void_p,
     ]
     _use(found, found.sb3_sparse_instructions(0).decode())
+    _share_threads(found)
     return found
+
+
+def _share_threads(found: ctypes.CDLL) -> None:
+    """Let the kernels use torch's own OpenMP threads, where torch has OpenMP."""
+    names = ("GOMP_parallel", "omp_get_thread_num", "omp_get_num_threads")
+    for path in sorted(Path(th.__file__).parent.glob("lib/lib*omp*")):
+        try:
+            openmp = ctypes.CDLL(str(path))
+            functions = [ctypes.cast(getattr(openmp, name), ctypes.c_void_p) for name in names]
+        except (OSError, AttributeError):
+            continue
+        found.sb3_sparse_share_threads(*functions)
+        return
 
 
 def why_missing() -> str | None:
