@@ -31,9 +31,10 @@ from stable_baselines3 import DQN, SAC, TD3
 from step_overhead import TORQUES, VECTOR, RandomEnv, fused_like_stock, off_policy, on_policy
 from torch.nn import functional
 
-from sb3_sparse.engine.chains import TILE, Chain, tiles_of
+from sb3_sparse.engine.chains import Chain
 from sb3_sparse.engine.linear import CompactLinear
 from sb3_sparse.engine.native.library import in_use
+from sb3_sparse.engine.products import TILE, tiles_of
 from sb3_sparse.engine.structure import Structure
 from sb3_sparse.sparsity.widths import equivalent_widths
 

@@ -13,7 +13,7 @@ from stable_baselines3.common.logger import configure
 from support import assert_masked, make, registered
 
 from sb3_sparse import SparsityCallback
-from sb3_sparse.engine import chains
+from sb3_sparse.engine import products
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.topology import DropGrow
 
@@ -88,8 +88,8 @@ def test_a_single_loss_is_handed_over_bit_for_bit(name, gradient_spy):
 @pytest.mark.parametrize("name", ["SAC", "DQN", "PPO", "TRPO"])
 def test_compact_layers_compute_dense_gradients_for_updates_only(name, method, dense, monkeypatch):
     computed = []
-    outer = chains._outer
-    monkeypatch.setattr(chains, "_outer", lambda *args: computed.append(0) or outer(*args))
+    outer = products._outer
+    monkeypatch.setattr(products, "_outer", lambda *args: computed.append(0) or outer(*args))
     model = make(name, policy_kwargs=dict(compute="sparse"))
     options = {} if method == "static" else {"update_interval": 6}
     model.learn(64, callback=SparsityCallback(method, **options))

@@ -17,9 +17,10 @@ import torch as th
 from torch import nn
 from torch.nn import functional
 
-from sb3_sparse.engine.chains import TILE, Chain, tiles_of
+from sb3_sparse.engine.chains import Chain
 from sb3_sparse.engine.linear import CompactLinear
 from sb3_sparse.engine.native.library import PATH, in_use
+from sb3_sparse.engine.products import TILE, tiles_of
 from sb3_sparse.engine.structure import Structure
 
 ROUNDS = 5
