@@ -43,6 +43,8 @@ class Chain:
 
         :raises UnsupportedError: for anything but float32 in main memory, ``columns`` wide
         """
+        if x.is_floating_point() and th.is_autocast_enabled("cpu"):
+            x = x.float()  # of a layer before, which does what autocast says
         if x.dtype != th.float32 or x.device.type != "cpu" or x.shape[-1:] != (self.columns,):
             raise UnsupportedError(
                 f"a layer that computes on non-zeros takes float32 on the CPU with "
@@ -50,7 +52,7 @@ class Chain:
                 "use compute='masked' for anything else"
             )
         lead = x.shape[:-1]
-        x = x.reshape(-1, self.columns).contiguous()
+        x = x.reshape(-1, self.columns).contiguous().resolve_neg()
         return x, x.shape[0], lead
 
     def run(self, x: th.Tensor, batch: int, tiled_in: bool, tiled_out: bool) -> th.Tensor:
@@ -61,8 +63,8 @@ class Chain:
             structures.append(structure)
             parameters += [values, layer.bias]
         how = Pass(self.relus, structures, self._references, batch, tiled_in, tiled_out)
-        if type(x) not in PLAIN or th._C._get_tracing_state() is not None:
-            return how.by_dense_weights(x, parameters)  # somebody wants the graph of operations
+        if _watched(x):
+            return how.by_dense_weights(x, parameters)
         if th.is_grad_enabled() and (
             x.requires_grad or any(p is not None and p.requires_grad for p in parameters)
         ):
@@ -71,3 +73,13 @@ class Chain:
         if batch == 1 and not tiled_in and not tiled_out:
             return how.single(x, parameters)
         return how.forward(x, parameters)[0]
+
+
+def _watched(x: th.Tensor) -> bool:
+    """Whether somebody wants to see single operations: tracing, fake tensors, torch.func."""
+    return (
+        type(x) not in PLAIN
+        or th._C._get_tracing_state() is not None
+        or th._C._len_torch_dispatch_stack() > 0
+        or th._C._functorch.peek_interpreter_stack() is not None
+    )

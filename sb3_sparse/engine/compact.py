@@ -13,7 +13,7 @@ from torch import nn
 
 from sb3_sparse.engine.gradients import DenseGradient, GradientMask, weakly
 from sb3_sparse.engine.layers import SparseLayer, moments_of
-from sb3_sparse.engine.linear import AWAITING, CompactLinear
+from sb3_sparse.engine.linear import NO_WEIGHT, CompactLinear
 from sb3_sparse.engine.masked import MaskedLayer
 from sb3_sparse.engine.structure import Structure
 
@@ -62,7 +62,7 @@ class CompactLayer(SparseLayer):
     def mask_targets(self) -> None:
         for target in self._targets:
             dense = target.dense().view(-1)
-            if dense.max() == AWAITING:  # parameters of a target that awaited its copy elsewhere
+            if dense.max() > NO_WEIGHT:  # parameters of a target that awaited its copy elsewhere
                 dense = self.module.dense().view(-1)
             target.restructure(self.module.structure, dense[self._flat()])
 

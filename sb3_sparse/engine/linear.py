@@ -14,7 +14,9 @@ from sb3_sparse.errors import CorruptStateError, UnsupportedError
 
 MASK_KEY = "weight_mask"
 AWAITING = float(th.finfo(th.float32).max)
-"""Value of a hard target's weights from a move of the mask to the next copy; no weight has it."""
+"""Value of a hard target's weights from a move of the mask to the next copy."""
+NO_WEIGHT = 1e30
+"""What is above is no weight but that value, perhaps scaled by somebody."""
 
 
 class Listener(Protocol):
@@ -72,7 +74,7 @@ class CompactLinear(nn.Linear):
     def live(self) -> tuple[Structure, th.Tensor]:
         """The connections to compute with now, and their values."""
         if self.snapshot is not None:
-            if self.weight.detach()[0].item() == AWAITING:
+            if self.weight.detach()[0].item() > NO_WEIGHT:
                 return self.snapshot
             self.snapshot = None  # the online network has been copied since
         return self.structure, self.weight

@@ -198,7 +198,7 @@ class Products(th.autograd.Function):
                 )
         if how.batch == 0:
             return None, *(th.zeros_like(tensor) if need else None for tensor, need in pairs)
-        grad = gradients[0].contiguous()
+        grad = gradients[0].contiguous().resolve_neg()
         arguments = list(ctx.arguments)
         grads: list[th.Tensor | None] = []
         for i, (parameter, need) in enumerate(zip(parameters, needs, strict=True)):

@@ -23,6 +23,7 @@ from sb3_sparse.engine.native.library import PATH, in_use
 from sb3_sparse.engine.products import TILE, tiles_of
 from sb3_sparse.engine.structure import Structure
 
+PLAIN: Any = dict(dtype=th.float32, device="cpu")  # whatever torch's defaults are
 ROUNDS = 5
 SECONDS_A_ROUND = 0.002
 
@@ -58,7 +59,8 @@ def timing_of(shape: tuple[int, int], nnz: int, batch: int) -> Timing:
     if key not in _known:
         _known.update(_read())
     if key not in _known:
-        _known[key] = _measure(shape, nnz, batch)
+        with th.inference_mode(False), th.autocast("cpu", enabled=False):
+            _known[key] = _measure(shape, nnz, batch)
         _write()
     return _known[key]
 
@@ -70,14 +72,14 @@ def _measure(shape: tuple[int, int], nnz: int, batch: int) -> Timing:
     weight = th.from_numpy(random.standard_normal((rows, columns), dtype=np.float32))
     inputs = th.from_numpy(random.standard_normal((batch, columns), dtype=np.float32))
     with th.random.fork_rng(devices=[]):
-        masked, twin = nn.Linear(columns, rows), nn.Linear(columns, rows)
+        masked, twin = (nn.Linear(columns, rows, **PLAIN) for _ in range(2))
     with th.no_grad():
         masked.weight.copy_(weight)
         twin.weight.copy_(weight)
     compact = CompactLinear.convert(twin, Structure(flat, shape), is_target=False)
-    mask = th.ones(rows, columns)
+    mask = th.ones(rows, columns, **PLAIN)
     chain = Chain([compact], [True])
-    tiles = th.zeros(tiles_of(batch), columns, TILE)
+    tiles = th.zeros(tiles_of(batch), columns, TILE, **PLAIN)
 
     def by_mask(x: th.Tensor) -> th.Tensor:
         return functional.relu(functional.linear(x, masked.weight, masked.bias))

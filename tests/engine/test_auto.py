@@ -138,6 +138,18 @@ def test_without_a_home_timings_are_measured_all_the_same(monkeypatch):
     assert timing.timing_of((4, 3), 5, 7).masked > 0
 
 
+def test_measuring_minds_no_default_of_torch(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(timing, "_known", {})
+    th.set_default_dtype(th.float64)
+    try:
+        with th.inference_mode(), th.autocast("cpu", dtype=th.bfloat16), th.device("meta"):
+            found = timing.timing_of((300, 300), 900, 64)
+    finally:
+        th.set_default_dtype(th.float32)
+    assert found.masked > 1e-5
+
+
 def test_what_is_compact_stays_so_in_later_choices(timings):
     root = nn.Sequential(nn.Linear(2, 3), nn.ReLU(), nn.Linear(3, 4))
     layers = layers_of(root)

@@ -8,6 +8,7 @@ from functools import partial
 import numpy as np
 import pytest
 import torch as th
+import torch.fx.experimental.proxy_tensor
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import nn
@@ -278,6 +279,29 @@ def test_a_traced_network_is_the_network():
         traced = th.jit.trace(compact, th.randn(2, 5))
     x = th.randn(7, 5)
     close(traced(x), dense(x))
+
+
+def test_who_watches_operations_sees_dense_ones():
+    dense, compact = networks([5, 8, 3], ["some"], nn.Tanh, True, 0)
+    x = th.randn(7, 5)
+    close(th.fx.experimental.proxy_tensor.make_fx(compact)(x)(-x), dense(-x))
+    close(th.func.vmap(compact)(x), dense(x))
+
+
+def test_negated_views_are_what_they_say():
+    dense, compact = networks([5, 8, 3], ["some"], nn.Tanh, True, 0)
+    x = th.randn(7, 5)
+    close(compact(th._neg_view(x)), dense(-x))
+
+
+def test_under_autocast_compact_layers_stay_float32():
+    dense, compact = networks([5, 8, 3], ["some"], nn.ReLU, True, 0)
+    mixed = nn.Sequential(dense[0], *list(compact)[1:])
+    x = th.randn(7, 5)
+    with th.autocast("cpu", dtype=th.bfloat16):
+        y = mixed(x)
+    assert y.dtype == th.float32
+    np.testing.assert_allclose(y.detach(), dense(x).detach(), atol=0.05)
 
 
 def test_torchs_defaults_change_nothing():

@@ -70,9 +70,11 @@ def library() -> ctypes.CDLL:
 def _share_threads(found: ctypes.CDLL) -> None:
     """Let the kernels use torch's own OpenMP threads, where torch has OpenMP."""
     names = ("GOMP_parallel", "omp_get_thread_num", "omp_get_num_threads")
-    for path in sorted(Path(th.__file__).parent.glob("lib/lib*omp*")):
+    folder = Path(th.__file__).parent / "lib"
+    paths = [path for name in ("gomp", "iomp", "omp") for path in folder.glob(f"lib{name}*")]
+    for path in [*map(str, paths), None]:  # None: what the process has loaded
         try:
-            openmp = ctypes.CDLL(str(path))
+            openmp = ctypes.CDLL(path)
             functions = [ctypes.cast(getattr(openmp, name), ctypes.c_void_p) for name in names]
         except (OSError, AttributeError):
             continue
