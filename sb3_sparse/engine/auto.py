@@ -144,14 +144,15 @@ def _may_gain(run: Sequence[SparseLayer]) -> bool:
 
 def _choose_run(run: Sequence[SparseLayer], batch: int) -> list[LayerChoice]:
     timings = [timing_of((layer.shape[0], layer.shape[1]), layer.nnz, batch) for layer in run]
+    call = timing_of((1, 1), 1, batch).compact  # next to nothing but the call
     kinds = tuple(layer.compact for layer in run)  # what is compact stays so
-    best = _seconds(run, timings, kinds)
+    best = _seconds(run, timings, kinds, call)
     enough = WORTH_CHANGING * sum(best)
     combinations: Iterable[tuple[bool, ...]] = product(*((kind, True) for kind in kinds))
     if len(run) > LONGEST:
         combinations = [(True,) * len(run)]
     for combination in combinations:
-        seconds = _seconds(run, timings, combination)
+        seconds = _seconds(run, timings, combination, call)
         if sum(seconds) < min(sum(best), enough):
             best, kinds = seconds, combination
     return [
@@ -161,9 +162,12 @@ def _choose_run(run: Sequence[SparseLayer], batch: int) -> list[LayerChoice]:
 
 
 def _seconds(
-    run: Sequence[SparseLayer], timings: Sequence[Timing], compact: Sequence[bool]
+    run: Sequence[SparseLayer], timings: Sequence[Timing], compact: Sequence[bool], call: float
 ) -> list[float]:
-    """Of each layer; conversions fall to compact layers beside one that is not."""
+    """Of each layer; conversions fall to compact layers beside one that is not.
+
+    :param call: what each call of the kernels costs; compact layers that follow each other share it
+    """
     found = []
     for i, (layer, timing) in enumerate(zip(run, timings, strict=True)):
         if not compact[i]:
@@ -173,7 +177,8 @@ def _seconds(
         share = timing.conversion / (rows + columns)
         converts_in = 0 if i and compact[i - 1] else columns
         converts_out = 0 if i + 1 < len(run) and compact[i + 1] else rows
-        found.append(timing.compact + share * (converts_in + converts_out))
+        shared = call if i and compact[i - 1] else 0.0
+        found.append(max(0.0, timing.compact - shared) + share * (converts_in + converts_out))
     return found
 
 

@@ -33,6 +33,7 @@ def timings(monkeypatch):
     """Made-up timings by shape, in place of measured ones."""
     known: dict[tuple[int, int], Timing] = {}
     monkeypatch.setattr(auto, "timing_of", lambda shape, nnz, batch: known[shape])
+    known[1, 1] = Timing(0.0, 0.0, 0.0)
     monkeypatch.setattr(auto, "WORTH_MEASURING", 1)
     return known
 
@@ -70,6 +71,18 @@ def test_conversions_count_only_where_a_compact_layer_meets_something_else(timin
     assert sum(layer.chosen_seconds for layer in choice.layers) == pytest.approx(
         0.1 + 0.8 + 0.1 + 0.6
     )
+
+
+def test_layers_that_follow_each_other_share_the_cost_of_the_call(timings):
+    # The second alone takes 1.1 of masked, but 0.3 of that is the call that the first makes anyway.
+    root = nn.Sequential(nn.Linear(3, 3), nn.ReLU(), nn.Linear(3, 4))
+    timings.update({(3, 3): Timing(2.0, 0.5, 0.1), (4, 3): Timing(1.0, 1.1, 0.1)})
+    assert choose(root, layers_of(root), 8).compact == ("0",)
+    timings[1, 1] = Timing(0.0, 0.3, 0.0)
+    choice = choose(root, layers_of(root), 8)
+    assert choice.compact == ("0", "2")
+    total = sum(layer.chosen_seconds for layer in choice.layers)
+    assert total == pytest.approx(0.5 + 0.1 * 3 / 6 + (1.1 - 0.3) + 0.1 * 4 / 7)
 
 
 def test_a_run_that_gains_less_than_a_tenth_stays_masked(timings):
@@ -172,7 +185,8 @@ def test_masks_that_are_quicker_everywhere_are_said_so(timings):
 
 def model_on_auto(monkeypatch, quicker: bool, **policy_kwargs):
     fake = Timing(1.0, 0.2 if quicker else 2.0, 0.1)
-    monkeypatch.setattr(auto, "timing_of", lambda shape, nnz, batch: fake)
+    call = Timing(0.0, 0.0, 0.0)
+    monkeypatch.setattr(auto, "timing_of", lambda shape, *_: call if shape == (1, 1) else fake)
     monkeypatch.setattr(auto, "WORTH_MEASURING", 200)
     return SAC(
         "SparsePolicy",
