@@ -52,8 +52,24 @@ def interleaved(steps: dict[str, Callable[[], Any]], rounds: int) -> dict[str, l
     return {name: found[1:] for name, found in times.items()}
 
 
-def speedup(times: dict[str, list[float]], name: str, base: str) -> float:
-    return median(a / b for a, b in zip(times[base], times[name], strict=True))
+def rows_of(
+    what: str, case: str, batch: int, sparsity: float, times: dict[str, list[float]], count: int
+) -> Iterator[dict]:
+    """A row of the CSV file for each variant; the first is what the others are compared with.
+
+    :param count: steps that each time is of
+    """
+    base = next(iter(times.values()))
+    for name, found in times.items():
+        yield {
+            "what": what,
+            "case": case,
+            "batch": batch,
+            "sparsity": sparsity,
+            "variant": name,
+            "milliseconds": 1e3 * median(found) / count,
+            "speedup": median(a / b for a, b in zip(base, found, strict=True)),
+        }
 
 
 # --- one layer ----------------------------------------------------------------------------------
@@ -129,16 +145,7 @@ def time_single(widths: list[int], sparsities: list[float], rounds: int) -> Iter
 
             steps = {"dense": partial(by, dense), "non-zeros": partial(by, chain)}
             times = interleaved(steps, rounds)
-            for name in steps:
-                yield {
-                    "what": "one",
-                    "case": f"17-{width}-{width}-6",
-                    "batch": 1,
-                    "sparsity": sparsity,
-                    "variant": name,
-                    "milliseconds": 1e3 * median(times[name]) / 200,
-                    "speedup": speedup(times, name, "dense"),
-                }
+            yield from rows_of("one", f"17-{width}-{width}-6", 1, sparsity, times, 200)
 
 
 def time_layers(widths: list[int], sparsities: list[float], rounds: int) -> Iterator[dict]:
@@ -152,16 +159,7 @@ def time_layers(widths: list[int], sparsities: list[float], rounds: int) -> Iter
                     for name, step in steps.items()
                 }
                 times = interleaved(repeated, rounds)
-                for name in steps:
-                    yield {
-                        "what": "layer",
-                        "case": f"{width}x{width}",
-                        "batch": batch,
-                        "sparsity": sparsity,
-                        "variant": name,
-                        "milliseconds": 1e3 * median(times[name]) / inner,
-                        "speedup": speedup(times, name, "dense"),
-                    }
+                yield from rows_of("layer", f"{width}x{width}", batch, sparsity, times, inner)
 
 
 # --- whole gradient steps -----------------------------------------------------------------------
@@ -251,17 +249,10 @@ def time_steps(
         trains = {name: timed(name, train) for name, (_, train, _) in variants.items()}
         variants["auto"][1]()  # sees the batch size; the next one chooses
         times = interleaved(trains, rounds)
-        for name, (model, _, count) in variants.items():
-            yield {
-                "what": "step",
-                "case": f"{algo} {width}",
-                "batch": ALGOS[algo][2],
-                "sparsity": sparsity,
-                "variant": name,
-                "milliseconds": 1e3 * median(times[name]) / count,
-                "speedup": speedup(times, name, "dense, stock"),
-                "megabytes": state_bytes(model) / 1e6,
-            }
+        rows = rows_of("step", f"{algo} {width}", ALGOS[algo][2], sparsity, times, steps)
+        for row in rows:
+            model, _, _ = variants[row["variant"]]
+            yield {**row, "megabytes": state_bytes(model) / 1e6}
         del variants, trains
         gc.collect()
 
@@ -288,16 +279,7 @@ def time_learn(width: int, sparsity: float, steps: int, rounds: int) -> Iterator
         return lambda: model.learn(steps, reset_num_timesteps=False)
 
     times = interleaved({name: learn(model) for name, model in models.items()}, rounds)
-    for name in models:
-        yield {
-            "what": "learn",
-            "case": f"SAC {width}, HalfCheetah-v5",
-            "batch": 256,
-            "sparsity": sparsity,
-            "variant": name,
-            "milliseconds": 1e3 * median(times[name]) / steps,
-            "speedup": speedup(times, name, "dense, stock"),
-        }
+    yield from rows_of("learn", f"SAC {width}, HalfCheetah-v5", 256, sparsity, times, steps)
 
 
 def table(path: Path) -> None:
