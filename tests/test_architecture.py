@@ -14,7 +14,7 @@ PACKAGE = ROOT / "sb3_sparse"
 FLOORS = [
     {"cli"},
     {"report", "experiments", "tuning"},
-    {"zoo", "analysis", "export", "compress"},
+    {"zoo", "analysis", "export", "compress", "launch"},
     {"callback"},
     {"policies"},
     {"networks", "wrappers"},
@@ -40,7 +40,10 @@ EDGES = {
     "matplotlib": {"report"},
     "rliable": {"report"},
     "onnx": {"export"},
-    "ray": {"tuning", "experiments"},
+    "ray": {"launch"},
+    "sqlalchemy": {"tuning"},
+    "plotly": {"tuning"},
+    "ruamel": {"tuning"},
 }
 FILES = sorted(PACKAGE.rglob("*.py"))
 

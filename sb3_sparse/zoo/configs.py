@@ -45,9 +45,10 @@ def config_path(method: str, algo: str) -> Path:
     return path
 
 
-def read_yaml(path: Path) -> dict[str, Any]:
+def read_yaml(path: Path, what: str = "environment ids to settings") -> dict[str, Any]:
     """The mapping in a YAML file.
 
+    :param what: it maps, for the message
     :raises ConfigError: if there is no such file, or no mapping in it
     """
     if not path.is_file():
@@ -57,7 +58,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
     except yaml.YAMLError as error:
         raise ConfigError(f"{path} is no valid YAML: {error}") from error
     if not isinstance(content, dict):
-        raise ConfigError(f"{path} must map environment ids to settings, got {content!r}")
+        raise ConfigError(f"{path} must map {what}, got {content!r}")
     return content
 
 

@@ -29,6 +29,7 @@ class Evaluation(EvalCallback):
     :param episodes: episodes of one evaluation
     :param deterministic: whether the policy acts deterministically
     :param on_new_best: called when there is a new best model
+    :param after_each: called after each evaluation
     """
 
     def __init__(
@@ -39,10 +40,12 @@ class Evaluation(EvalCallback):
         episodes: int,
         deterministic: bool,
         on_new_best: BaseCallback,
+        after_each: BaseCallback | None = None,
     ) -> None:
         super().__init__(
             eval_env,
             callback_on_new_best=on_new_best,
+            callback_after_eval=after_each,
             n_eval_episodes=episodes,
             eval_freq=1,  # whenever _on_step below lets it
             log_path=str(folder),

@@ -54,13 +54,9 @@ def match_parameters(
     hidden = [place.get() for place in _places(kwargs)]
 
     def parameters(changed: dict[str, Any]) -> int:
-        policy_class: Any = algorithm.policy_aliases[SparsePolicy]
-        if settings.get("use_sde"):
-            changed = {**changed, "use_sde": True}
-        policy = policy_class(
-            observation_space, action_space, BasePolicy._dummy_schedule, **deepcopy(changed)
+        policy = untrained_policy(
+            algorithm, observation_space, action_space, {**settings, "policy_kwargs": changed}
         )
-        assert isinstance(policy, SparsePolicyMixin)
         return policy.sparsity_report().parameters
 
     def scaled(widths: list[int]) -> dict[str, Any]:
@@ -72,6 +68,22 @@ def match_parameters(
     target = parameters({**kwargs, "sparsity": sparsity})
     widths, achieved = equivalent_widths(hidden, lambda w: parameters(scaled(w)), target)
     return Match(sparsity, target, achieved, scaled(widths))
+
+
+def untrained_policy(
+    algorithm: type[BaseAlgorithm],
+    observation_space: spaces.Space[Any],
+    action_space: spaces.Space[Any],
+    settings: Mapping[str, Any],
+) -> SparsePolicyMixin:
+    """A policy as the algorithm would make it from these settings, to be looked at."""
+    kwargs = deepcopy(dict(settings["policy_kwargs"]))
+    if settings.get("use_sde"):
+        kwargs["use_sde"] = True
+    policy_class: Any = algorithm.policy_aliases[SparsePolicy]
+    policy = policy_class(observation_space, action_space, BasePolicy._dummy_schedule, **kwargs)
+    assert isinstance(policy, SparsePolicyMixin)
+    return policy
 
 
 def _with_widths(policy_kwargs: Mapping[str, Any], space: spaces.Space[Any]) -> dict[str, Any]:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -14,6 +17,7 @@ from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 from sb3_sparse.zoo.run import Run
 
 FINAL_EPISODES = 20
+SCORED_SHARE = 0.1
 
 
 @dataclass(frozen=True)
@@ -51,6 +55,17 @@ class Outcome:
     def finished(self) -> bool:
         """Whether it came to its end."""
         return bool(self.results)
+
+
+def score_of(mean_returns: Sequence[float]) -> float:
+    """Score of a run: the mean over the last 10 % of its evaluations, and at least one.
+
+    :param mean_returns: mean episode return of each evaluation, in order
+
+    Source: arXiv:2206.10369, section 3 (experimental details).
+    """
+    last = max(1, math.ceil(SCORED_SHARE * len(mean_returns) - 1e-9))
+    return fmean(mean_returns[-last:])
 
 
 def final_results(

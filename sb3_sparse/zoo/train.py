@@ -4,19 +4,15 @@ from __future__ import annotations
 
 import importlib.util
 import shutil
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
-import torch as th
-from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_sparse.errors import ConfigError, MissingExtra, SparsityError
+from sb3_sparse.errors import ConfigError
 from sb3_sparse.policies.mixin import SparsePolicyMixin
 from sb3_sparse.zoo.checkpoint import (
     Checkpoints,
@@ -29,6 +25,7 @@ from sb3_sparse.zoo.checkpoint import (
 from sb3_sparse.zoo.evaluation import Evaluation
 from sb3_sparse.zoo.experiment import Experiment, spaces_of
 from sb3_sparse.zoo.match import match_parameters
+from sb3_sparse.zoo.prepare import doubt, explained, prepare
 from sb3_sparse.zoo.record import read_record, sparsity_of, versions, write_record
 from sb3_sparse.zoo.results import Outcome, final_results
 from sb3_sparse.zoo.run import Run
@@ -43,6 +40,7 @@ def train(
     log_folder: Path = Path("logs"),
     callbacks: Sequence[BaseCallback] = (),
     tensorboard_log: str = "",
+    after_evaluation: BaseCallback | None = None,
 ) -> Outcome:
     """Train anew in ``log_folder/<algo>/<env>_<number>``.
 
@@ -50,26 +48,24 @@ def train(
 
     :param callbacks: further callbacks
     :param tensorboard_log: where TensorBoard's files go; empty: none
+    :param after_evaluation: called after each evaluation; the evaluation is its ``parent``
     :raises ConfigError: if the environment cannot be made or the algorithm cannot act in it
     """
     if tensorboard_log and importlib.util.find_spec("tensorboard") is None:
         raise ConfigError("--tensorboard-log needs TensorBoard: pip install tensorboard")
     if tensorboard_log:
         tensorboard_log = str(Path(tensorboard_log).absolute())  # also after a resume elsewhere
-    if run.device.startswith("cuda") and not th.cuda.is_available():
-        raise ConfigError(f"there is no device {run.device!r} here; give --device auto or cpu")
-    settings, evaluation = run.settings(), run.evaluation()
-    failure = f"the settings of {run.env_id} in {run.config}, with what you changed, do not work"
-    with explained(failure, run.env_id):
-        observation_space, action_space = spaces_of(
-            run, settings, log_folder / run.algo / "new", evaluation
-        )
-    check_action_space(run, action_space)
-    use_few_threads(observation_space)
+    prepared = prepare(run, log_folder)
+    settings, evaluation = prepared.settings, prepared.evaluation
+    use_few_threads(prepared.observation_space)
     record: dict[str, Any] = {}
     if run.match_params is not None:
         match = match_parameters(
-            run.algorithm, observation_space, action_space, settings, run.match_params
+            run.algorithm,
+            prepared.observation_space,
+            prepared.action_space,
+            settings,
+            run.match_params,
         )
         settings["policy_kwargs"] = match.policy_kwargs
         record["match"] = asdict(match)
@@ -88,10 +84,10 @@ def train(
         )
         model = None
         try:
-            with explained(failure, run.env_id):
+            with explained(doubt(run), run.env_id):
                 experiment = Experiment(run, settings, folder, evaluation, None, tensorboard_log)
                 model = experiment.setup()
-            return _learn(run, experiment, model, folder, None, callbacks)
+            return _learn(run, experiment, model, folder, None, callbacks, after_evaluation)
         except Exception as error:
             if model is None or model.num_timesteps == 0:
                 shutil.rmtree(folder)  # nothing was trained
@@ -145,6 +141,7 @@ def _learn(
     folder: Path,
     start: Path | None,
     callbacks: Sequence[BaseCallback],
+    after_evaluation: BaseCallback | None = None,
 ) -> Outcome:
     policy = model.policy
     assert isinstance(policy, SparsePolicyMixin)
@@ -159,6 +156,7 @@ def _learn(
         schedule["eval_episodes"],
         experiment.deterministic_eval,
         experiment.keep_normalization(),
+        after_evaluation,
     )
     checkpoints = Checkpoints(folder, experiment.env_name, evaluation)
     if start is None:
@@ -202,43 +200,6 @@ def _learn(
     )
     clear_checkpoints(folder)
     return Outcome(folder, model, results)
-
-
-@contextmanager
-def explained(failure: str, env_id: str) -> Iterator[None]:
-    """Turn what environment, zoo and algorithm raise before training into one of our errors.
-
-    :param failure: what does not work then
-    """
-    try:
-        yield
-    except SparsityError:
-        raise
-    except gym.error.DependencyNotInstalled as error:
-        if "mujoco" in str(error).lower():
-            raise MissingExtra(env_id, "mujoco") from error
-        raise ConfigError(f"{env_id} cannot be made: {error}") from error
-    except Exception as error:
-        raise ConfigError(f"{failure}: {type(error).__name__}: {error}") from error
-
-
-def check_action_space(run: Run, space: spaces.Space[Any]) -> None:
-    """Refuse an environment whose actions the algorithm cannot choose.
-
-    :raises ConfigError: if so
-    """
-    discrete = isinstance(space, spaces.Discrete)
-    discrete_only = run.algo in ("dqn", "qrdqn")
-    box_only = run.algo in ("sac", "td3", "ddpg", "tqc", "crossq")
-    if (discrete_only and not discrete) or (box_only and not isinstance(space, spaces.Box)):
-        others = (
-            "dqn, qrdqn, ppo, a2c or trpo"
-            if discrete
-            else "sac, td3, ddpg, tqc, crossq, ppo, a2c or trpo"
-        )
-        raise ConfigError(
-            f"{run.algo} cannot act in {run.env_id}, whose actions are {space}; take {others}"
-        )
 
 
 def new_run_folder(parent: Path, env_name: str) -> Path:

@@ -1,0 +1,39 @@
+"""The command line: ``sb3-sparse train``, ``enjoy``, ``inspect`` and ``tune``."""
+
+from __future__ import annotations
+
+import sys
+
+from sb3_sparse.errors import MissingExtra, SparsityError
+
+try:
+    import typer
+    from rich.console import Console
+
+    from sb3_sparse.cli.look import enjoy, inspect
+    from sb3_sparse.cli.train import train
+    from sb3_sparse.cli.tune import tuning
+except ImportError as error:
+    sys.exit(str(error if isinstance(error, MissingExtra) else MissingExtra("this command", "zoo")))
+
+MORE_VALUES = {"allow_extra_args": True}
+
+app = typer.Typer(
+    add_completion=False,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    help="Sparse training inside Stable-Baselines3.",
+)
+app.command(context_settings=MORE_VALUES)(train)
+app.command()(enjoy)
+app.command()(inspect)
+app.add_typer(tuning, name="tune")
+
+
+def main() -> None:
+    """Run the command line; a user's mistake is one line on stderr and exit code 2."""
+    try:
+        app(standalone_mode=True)
+    except (SparsityError, OSError) as error:
+        Console(stderr=True, highlight=False).print(f"Error: {error}", markup=False, soft_wrap=True)
+        sys.exit(2)

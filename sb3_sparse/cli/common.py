@@ -1,0 +1,54 @@
+"""What the commands share: the console, and the options that say what is trained."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+
+console = Console(highlight=False)
+INTERRUPTED = 130
+AS_CONFIG = "as the config"
+
+
+def text(help: str, *names: str, shown: str | bool = True) -> Any:
+    """An option."""
+    return typer.Option(*names, help=help, show_default=shown)
+
+
+Algo = Annotated[str, text("Algorithm: dqn, sac, ppo, td3, tqc, ...")]
+Env = Annotated[str, text("Gymnasium environment id.")]
+Method = Annotated[str | None, text("dense, prune, static, set or rigl.", shown="rigl")]
+Sparsity = Annotated[float | None, text("Removed fraction, in [0, 1).", shown=AS_CONFIG)]
+Distribution = Annotated[str | None, text("erk, er or uniform.", shown="erk")]
+Steps = Annotated[int | None, text("Environment steps.", "--n-timesteps", "-n", shown=AS_CONFIG)]
+Envs = Annotated[int | None, text("Environments side by side.", shown=AS_CONFIG)]
+Hyperparams = Annotated[
+    list[str] | None,
+    text(
+        "Anything else, as name:value ..., e.g. learning_rate:0.001 weight_decay:1e-4 "
+        "update_interval:500.",
+        "--hyperparams",
+        "-params",
+    ),
+]
+ConfFile = Annotated[
+    str | None,
+    text(
+        "A YAML file in rl-zoo's form, or another shipped one by name (dqn_impala).",
+        "--conf-file",
+        "-conf",
+    ),
+]
+EvalFreq = Annotated[int | None, text("Steps between two evaluations.", shown="as the paper")]
+EvalEpisodes = Annotated[int | None, text("Episodes of an evaluation.", shown="as the paper")]
+Device = Annotated[str, text("auto, cpu or cuda.")]
+LogFolder = Annotated[Path, text("Where folders are made.", "--log-folder", "-f")]
+
+
+def print_score(what: str, mean: float, std: float, path: Path) -> None:
+    """A line on a policy's return."""
+    score = f"{mean:.1f} ± {std:.1f}"
+    console.print(f"{what:<13} [bold]{score}[/bold]  {path}", soft_wrap=True)

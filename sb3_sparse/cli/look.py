@@ -1,0 +1,37 @@
+"""``sb3-sparse enjoy`` and ``inspect``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from sb3_sparse.cli.common import console, print_score, text
+from sb3_sparse.zoo.inspect import inspect_model
+
+
+def enjoy(
+    run: Annotated[Path, typer.Argument(help="A run's folder, e.g. logs/dqn/CartPole-v1_1.")],
+    episodes: Annotated[int, text("How many episodes.", "--episodes", "-n")] = 20,
+    best: Annotated[bool, text("The best policy instead of the last.", "--best")] = False,
+    video: Annotated[bool, text("Record a video of the first 1000 steps.", "--video")] = False,
+    seed: Annotated[int, text("Seed of the environment.")] = 0,
+) -> None:
+    """Evaluate what a run has trained, and record a video of it."""
+    from sb3_sparse.zoo.enjoy import enjoy as score_run
+
+    score = score_run(run, episodes, best, video, seed)
+    console.print(f"Return over {score.episodes} episodes:")
+    print_score(
+        "Best policy:" if best else "Last policy:", score.mean_return, score.std_return, score.model
+    )
+    for path in score.videos:
+        console.print(f"Video: {path}", soft_wrap=True)
+
+
+def inspect(
+    model: Annotated[Path, typer.Argument(help="A model saved by SB3 (.zip).")],
+) -> None:
+    """Print the layers of a saved sparse model, and how they are best computed on this machine."""
+    console.print(str(inspect_model(model)), soft_wrap=True)

@@ -1,0 +1,145 @@
+"""``sb3-sparse train``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from sb3_sparse.cli.common import (
+    INTERRUPTED,
+    Algo,
+    ConfFile,
+    Device,
+    Distribution,
+    Env,
+    Envs,
+    EvalEpisodes,
+    EvalFreq,
+    Hyperparams,
+    LogFolder,
+    Method,
+    Sparsity,
+    Steps,
+    console,
+    print_score,
+    text,
+)
+from sb3_sparse.errors import ConfigError
+from sb3_sparse.zoo.progress import TrainingProgress
+from sb3_sparse.zoo.run import Run
+from sb3_sparse.zoo.settings import method_of, parse_overrides
+
+
+def train(
+    context: typer.Context,
+    algo: Algo = "dqn",
+    env: Env = "CartPole-v1",
+    method: Method = None,
+    sparsity: Sparsity = None,
+    distribution: Distribution = None,
+    match_params: Annotated[
+        float | None,
+        text(
+            "With --method dense: a dense network with as few parameters as this sparsity leaves."
+        ),
+    ] = None,
+    seed: Annotated[int, text("Seed of everything.")] = 0,
+    n_timesteps: Steps = None,
+    n_envs: Envs = None,
+    hyperparams: Hyperparams = None,
+    conf_file: ConfFile = None,
+    eval_freq: EvalFreq = None,
+    eval_episodes: EvalEpisodes = None,
+    device: Device = "auto",
+    tensorboard_log: Annotated[
+        str, text("Folder of TensorBoard's files.", "--tensorboard-log", "-tb")
+    ] = "",
+    log_folder: LogFolder = Path("logs"),
+    resume: Annotated[
+        Path | None, text("Go on with an interrupted run: its folder. Takes no other option.")
+    ] = None,
+) -> None:
+    """Train, evaluate and save a sparse policy. Without arguments: DQN, RigL, 90 %, CartPole-v1."""
+    from sb3_sparse.zoo import train as engine  # rl_zoo3 takes its time to import
+
+    progress = TrainingProgress(console)
+    try:
+        if resume is not None:
+            _refuse_other_options(context)
+            console.print(f"Going on with {resume}", soft_wrap=True)
+            outcome = engine.resume(resume, [progress])
+        else:
+            if context.args and not hyperparams:
+                raise ConfigError(f"unexpected argument {context.args[0]!r}; see --help")
+            run = Run(
+                algo=algo.lower(),
+                env_id=env,
+                method=method,
+                sparsity=sparsity,
+                distribution=distribution,
+                match_params=match_params,
+                seed=seed,
+                n_timesteps=n_timesteps,
+                n_envs=n_envs,
+                hyperparams=parse_overrides([*(hyperparams or []), *context.args]),
+                conf_file=conf_file,
+                eval_freq=eval_freq,
+                eval_episodes=eval_episodes,
+                device=device,
+            )
+            console.print(_headline(run))
+            outcome = engine.train(run, log_folder, [progress], tensorboard_log)
+    except KeyboardInterrupt:
+        console.print(
+            "Interrupted. A run that had begun goes on with sb3-sparse train --resume ITS_FOLDER"
+        )
+        raise typer.Exit(INTERRUPTED) from None
+    finally:
+        progress.close()
+    if not outcome.finished:
+        steps = outcome.model.num_timesteps
+        console.print(f"Stopped after {steps} steps. Go on with:", soft_wrap=True)
+        console.print(f"sb3-sparse train --resume {outcome.folder}", soft_wrap=True)
+        raise typer.Exit(INTERRUPTED)
+    results = outcome.results
+    reached = engine.reached_sparsity(outcome.model)
+    console.print(f"Sparsity {reached:.2%}. Return over {results[0].episodes} episodes:")
+    for result in results:
+        print_score(f"{result.what}:", result.mean_return, result.std_return, result.path)
+    best = " --best" if len(results) > 1 else ""
+    console.print(
+        "The best policy was chosen by other episodes. Look at it:" if best else "Look at it:"
+    )
+    for command in (f"enjoy {outcome.folder}{best}", f"inspect {results[-1].path}"):
+        console.print(f"sb3-sparse {command}", soft_wrap=True)
+
+
+def _headline(run: Run) -> str:
+    settings = run.settings()
+    kwargs, method = settings["policy_kwargs"], method_of(settings)
+    if run.match_params is not None:
+        how = f"dense with the parameters of {run.match_params:.0%}"
+    elif method == "dense":
+        how = method
+    else:
+        sparsity = kwargs["sparsity"]
+        share = f"{sparsity:.0%}" if isinstance(sparsity, float) else str(sparsity)
+        how = f"{method} at {share} ({kwargs.get('distribution', 'erk').upper()})"
+    return f"Training {run.algo.upper()} on {run.env_id}, {how}, seed {run.seed}"
+
+
+def _refuse_other_options(context: typer.Context) -> None:
+    """A resumed run is the run that it was."""
+    given = [
+        name
+        for name in context.params
+        if (source := context.get_parameter_source(name)) is not None
+        and source.name == "COMMANDLINE"
+    ]
+    others = [f"--{name.replace('_', '-')}" for name in given if name != "resume"]
+    if others or context.args:
+        raise ConfigError(
+            f"--resume takes everything from the run; drop {' '.join([*others, *context.args])}"
+        )

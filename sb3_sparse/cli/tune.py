@@ -1,0 +1,212 @@
+"""``sb3-sparse tune`` and ``sb3-sparse tune report``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from sb3_sparse.cli.common import (
+    INTERRUPTED,
+    Algo,
+    ConfFile,
+    Device,
+    Distribution,
+    Env,
+    Envs,
+    EvalEpisodes,
+    EvalFreq,
+    Hyperparams,
+    LogFolder,
+    Method,
+    Sparsity,
+    Steps,
+    console,
+    text,
+)
+from sb3_sparse.cli.tuneprogress import TuningProgress, values_in_words
+from sb3_sparse.zoo.run import Run
+from sb3_sparse.zoo.settings import parse_overrides
+
+if TYPE_CHECKING:
+    from sb3_sparse.tuning import Tuned
+
+SEARCH = "search"
+
+
+class _SearchByDefault(TyperGroup):
+    """``tune ...`` is ``tune search ...`` unless another command is named."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        return super().parse_args(
+            ctx, args if args and args[0] in self.commands else [SEARCH, *args]
+        )
+
+
+tuning = typer.Typer(cls=_SearchByDefault)
+Storage = Annotated[
+    str | None,
+    text(
+        "A journal file, or a database: postgresql://user:password@host/database, sqlite:///file.db.",
+        shown="tune/journal.log in the log folder",
+    ),
+]
+
+
+@tuning.command(SEARCH, context_settings={"allow_extra_args": True})
+def search(
+    context: typer.Context,
+    algo: Algo = "dqn",
+    env: Env = "CartPole-v1",
+    method: Method = None,
+    sparsity: Sparsity = None,
+    distribution: Distribution = None,
+    space: Annotated[
+        str, text("paper (its grid), wide (continuous), or a file of your own, .yml or .py.")
+    ] = "paper",
+    trials: Annotated[
+        int | None,
+        text("How many trials.", "--trials", "--n-trials", shown="a whole grid, else 100"),
+    ] = None,
+    seeds: Annotated[int, text("Runs a trial; the mean counts.")] = 1,
+    sampler: Annotated[
+        str | None, text("grid, tpe or random.", shown="grid where all is lists, else tpe")
+    ] = None,
+    pruner: Annotated[
+        str | None,
+        text("none, median, halving or hyperband.", shown="none for a grid, else median"),
+    ] = None,
+    workers: Annotated[int, text("Trials at once, each a process of one thread.")] = 1,
+    launcher: Annotated[
+        str, text("local: processes of this machine; ray: a Ray cluster.")
+    ] = "local",
+    address: Annotated[
+        str | None, text("Of the Ray cluster, e.g. auto.", shown="one of this machine")
+    ] = None,
+    storage: Storage = None,
+    study_name: Annotated[
+        str | None, text("Name of the study.", shown="made of algorithm, env, method, space")
+    ] = None,
+    write_into: Annotated[
+        Path | None,
+        text("A config, e.g. zoo_hparams/rigl/sac.yml, whose entry gets the best values too."),
+    ] = None,
+    seed: Annotated[int, text("First seed of every trial, and the sampler's.")] = 0,
+    n_timesteps: Steps = None,
+    n_envs: Envs = None,
+    hyperparams: Hyperparams = None,
+    conf_file: ConfFile = None,
+    eval_freq: EvalFreq = None,
+    eval_episodes: EvalEpisodes = None,
+    device: Device = "auto",
+    log_folder: LogFolder = Path("logs"),
+) -> None:
+    """Search hyperparameters with Optuna; `sb3-sparse tune report STUDY` looks at a study.
+
+    The same command goes on with an interrupted study, and on another machine joins it.
+    """
+    from sb3_sparse.launch import launcher_named
+    from sb3_sparse.tuning import tune
+    from sb3_sparse.tuning.best import write_into as merge
+
+    run = Run(
+        algo=algo.lower(),
+        env_id=env,
+        method=method,
+        sparsity=sparsity,
+        distribution=distribution,
+        seed=seed,
+        n_timesteps=n_timesteps,
+        n_envs=n_envs,
+        hyperparams=parse_overrides([*(hyperparams or []), *context.args]),
+        conf_file=conf_file,
+        eval_freq=eval_freq,
+        eval_episodes=eval_episodes,
+        device=device,
+    )
+    if write_into is not None and not write_into.is_file():
+        raise typer.BadParameter(f"there is no config {write_into}", param_hint="--write-into")
+    progress = TuningProgress(console)
+    try:
+        tuned = tune(
+            run,
+            space,
+            trials=trials,
+            seeds=seeds,
+            sampler=sampler,
+            pruner=pruner,
+            name=study_name,
+            storage=storage,
+            log_folder=log_folder,
+            workers=workers,
+            launcher=launcher_named(launcher, address),
+            watch=progress,
+        )
+    except KeyboardInterrupt:
+        progress.close()
+        console.print("Interrupted. What was done is kept; the same command goes on.")
+        raise typer.Exit(INTERRUPTED) from None
+    finally:
+        progress.close()
+    _print_outcome(run, tuned, storage, log_folder)
+    if write_into is not None and tuned.best is not None:
+        merge(tuned.study, write_into)
+        console.print(f"Merged into {write_into}", soft_wrap=True)
+    if not tuned.standing.finished:
+        raise typer.Exit(1)
+
+
+def _print_outcome(run: Run, tuned: Tuned, storage: str | None, log_folder: Path) -> None:
+    standing, name = tuned.standing, tuned.study.study_name
+    for worker, error in tuned.errors.items():
+        console.print(f"{worker}: {error}", markup=False, soft_wrap=True)
+    done = f"{len(standing.done)} of {standing.planned} trials are done"
+    if not tuned.began:
+        console.print(f"The study {name} is finished: {done}. Nothing to do.", soft_wrap=True)
+    elif standing.finished:
+        console.print(f"Study {name}: {done}.", soft_wrap=True)
+    else:
+        console.print(
+            f"Study {name}: {done}, {len(standing.failed)} failed; the logs of the workers are in "
+            f"{tuned.folder}. The same command goes on, and tries failed trials again.",
+            soft_wrap=True,
+        )
+    if tuned.best is None or tuned.config is None:
+        return
+    values = values_in_words(tuned.best)
+    console.print(
+        f"Best: [bold]{tuned.best.values[0]:.6g}[/bold], trial {tuned.best.number}: {values}"
+    )
+    console.print("Train with these values, look at the study:")
+    where = [] if storage is None else [f"--storage {_quoted(storage)}"]
+    where += [] if log_folder == Path("logs") else [f"--log-folder {log_folder}"]
+    for command in (
+        f"train --algo {run.algo} --env {run.env_id} --conf-file {tuned.config}",
+        " ".join(["tune report", name, *where]),
+    ):
+        console.print(f"sb3-sparse {command}", markup=False, soft_wrap=True)
+
+
+def _quoted(storage: str) -> str:
+    from sb3_sparse.tuning.storage import shown_url
+
+    return f"'{shown_url(storage)}'"
+
+
+@tuning.command()
+def report(
+    studies: Annotated[list[str], typer.Argument(help="Names of studies.", metavar="STUDY...")],
+    storage: Storage = None,
+    out: Annotated[
+        Path | None, text("The page.", shown="report.html in the first study's folder")
+    ] = None,
+    log_folder: LogFolder = Path("logs"),
+) -> None:
+    """Write one HTML page on studies, and a CSV of their trials."""
+    from sb3_sparse.tuning.report import report_on
+
+    page = report_on(studies, storage, log_folder, out)
+    console.print(f"Page: {page}", soft_wrap=True)
+    console.print(f"Trials: {page.with_suffix('.csv')}", soft_wrap=True)

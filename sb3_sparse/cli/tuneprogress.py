@@ -1,0 +1,76 @@
+"""What a user sees while a study goes on."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+if TYPE_CHECKING:
+    from sb3_sparse.tuning.backend import FrozenTrial
+    from sb3_sparse.tuning.study import Standing
+
+
+def values_in_words(trial: FrozenTrial) -> str:
+    """A trial's values in a line."""
+    values = trial.user_attrs.get("hyperparams", trial.params)
+    return ", ".join(f"{name} {_short(value)}" for name, value in values.items())
+
+
+def _short(value: object) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+class TuningProgress:
+    """A line for each trial that ends, and below them a bar with the best so far.
+
+    :param console: where to print; one that is no terminal gets the lines alone
+    """
+
+    def __init__(self, console: Console) -> None:
+        self.console = console
+        self.seen: set[int] | None = None
+        self.bar = Progress(
+            BarColumn(bar_width=30),
+            MofNCompleteColumn(),
+            TextColumn("trials, {task.fields[status]}"),
+            TimeElapsedColumn(),
+            console=console,
+            disable=not console.is_terminal,
+        )
+        self.task = self.bar.add_task("", total=None, status="starting")
+
+    def __call__(self, standing: Standing) -> None:
+        """Show how far it is."""
+        if self.seen is None:
+            self.seen = {trial.number for trial in standing.done}
+            self.bar.start()
+        over = [trial for trial in (*standing.done, *standing.failed)]
+        for trial in over:
+            if trial.number not in self.seen:
+                self.seen.add(trial.number)
+                self.console.print(self._line(trial, standing), markup=False, soft_wrap=True)
+        best = standing.best
+        status = "best –" if best is None else f"best {best.values[0]:.6g} (trial {best.number})"
+        running = f"{len(standing.running)} running, {status}"
+        self.bar.update(
+            self.task, completed=len(standing.done), total=standing.planned, status=running
+        )
+
+    @staticmethod
+    def _line(trial: FrozenTrial, standing: Standing) -> str:
+        if trial in standing.failed:
+            return (
+                f"trial {trial.number} failed: {trial.user_attrs.get('error', 'no reason known')}"
+            )
+        best = standing.best
+        how = "pruned at" if trial not in standing.complete else "score"
+        value = f"{trial.values[0]:.6g}" if trial.values else "–"
+        so_far = "" if best is None else f", best so far {best.values[0]:.6g} (trial {best.number})"
+        count = f"{len(standing.done)} of {standing.planned}"
+        return f"{count}: trial {trial.number} {how} {value}{so_far}; {values_in_words(trial)}"
+
+    def close(self) -> None:
+        """Give the terminal back, also after an interruption."""
+        self.bar.stop()

@@ -1,0 +1,19 @@
+"""Tuning with Optuna: the paper's grids and beyond, from one process to many machines."""
+
+from sb3_sparse.tuning.objective import Objective
+from sb3_sparse.tuning.report import write_report
+from sb3_sparse.tuning.shipped import paper_space, wide_space
+from sb3_sparse.tuning.spacefile import space_of
+from sb3_sparse.tuning.spaces import Space
+from sb3_sparse.tuning.tune import Tuned, tune
+
+__all__ = [
+    "Objective",
+    "Space",
+    "Tuned",
+    "paper_space",
+    "space_of",
+    "tune",
+    "wide_space",
+    "write_report",
+]

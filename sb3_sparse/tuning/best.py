@@ -1,0 +1,86 @@
+"""The best values of a study, as settings that train as they are."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from sb3_sparse.errors import ConfigError
+from sb3_sparse.tuning.backend import FrozenTrial, optuna
+from sb3_sparse.tuning.objective import VALUES
+from sb3_sparse.tuning.spaces import with_values
+from sb3_sparse.tuning.study import definition_of, standing_of
+from sb3_sparse.tuning.yamlfile import as_yaml, merge_entry
+from sb3_sparse.zoo.configs import entry_of
+from sb3_sparse.zoo.environments import is_atari
+from sb3_sparse.zoo.settings import method_of
+
+BEST = "best.yml"
+TUNED = "Tuned by sb3-sparse"
+
+
+def best_of(study: optuna.Study) -> FrozenTrial:
+    """The best trial so far.
+
+    :raises ConfigError: if none was completed
+    """
+    best = standing_of(study).best
+    if best is None:
+        raise ConfigError(f"no trial of {study.study_name!r} was completed yet; let it go on")
+    return best
+
+
+def best_settings(study: optuna.Study) -> dict[str, Any]:
+    """The settings of the tuned run with the best values so far.
+
+    :raises ConfigError: if no trial was completed
+    """
+    values = best_of(study).user_attrs[VALUES]
+    return with_values(definition_of(study).run, values).settings()
+
+
+def describe_best(study: optuna.Study) -> str:
+    """Where the values come from, in a line: study, number of trials, score, date."""
+    standing, best = standing_of(study), best_of(study)
+    seeds = definition_of(study).seeds
+    mean = f", mean of {seeds} seeds" if seeds > 1 else ""
+    finished = [t.datetime_complete for t in standing.done if t.datetime_complete is not None]
+    return (
+        f"{TUNED}: study {study.study_name}, trial {best.number} of {len(standing.done)} trials, "
+        f"score {best.values[0]:.6g}{mean}, {max(finished).date()}"
+    )
+
+
+def write_best(study: optuna.Study, path: Path) -> Path:
+    """Write the best settings as a YAML file in rl-zoo's form.
+
+    :raises ConfigError: if no trial was completed
+    """
+    env_id = definition_of(study).run.env_id
+    text = as_yaml({env_id: best_settings(study)})
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(f"# {describe_best(study)}\n{text}")
+    return path
+
+
+def write_into(study: optuna.Study, path: Path) -> None:
+    """Merge the best settings into the tuned environment's entry of an existing YAML file.
+
+    Every other line of the file stays as it is, comments too.
+
+    :param path: in rl-zoo's form, e.g. ``zoo_hparams/rigl/sac.yml``
+    :raises ConfigError: if no trial was completed, or the file is for another method or cannot be
+        changed without changing what else it says; then it is left as it was
+    """
+    definition, settings = definition_of(study), best_settings(study)
+    env_id = definition.run.env_id
+    there = method_of(entry_of(path, env_id, is_atari(env_id)))
+    if there != definition.method:
+        raise ConfigError(
+            f"{path} trains {env_id} by method {there!r}, but {definition.method!r} was tuned; "
+            "name the file of that method"
+        )
+    text = merge_entry(path.read_text(), env_id, settings, describe_best(study), TUNED, str(path))
+    new = path.with_suffix(".new")
+    new.write_text(text)
+    new.replace(path)

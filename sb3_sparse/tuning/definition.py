@@ -1,0 +1,152 @@
+"""What a study is: written into it when it is made, compared when it is joined."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from math import prod
+from typing import Any
+
+from sb3_sparse.engine.native.library import why_missing
+from sb3_sparse.errors import ConfigError
+from sb3_sparse.tuning.backend import optuna
+from sb3_sparse.tuning.objective import planned_evaluations
+from sb3_sparse.tuning.samplers import pruner_of, sampler_of
+from sb3_sparse.tuning.spaces import Space, check_space, with_values
+from sb3_sparse.zoo.run import Run
+from sb3_sparse.zoo.settings import method_of, policy_kwargs_of
+
+ATTRIBUTE = "sb3_sparse"
+SPARSE_FROM = 0.8
+DEFAULT_TRIALS = 100
+
+
+@dataclass(frozen=True)
+class Definition:
+    """What is tuned, and how.
+
+    :param run: with the first seed of every trial; the samplers' seed too
+    :param space: what is searched
+    :param seeds: runs a trial
+    :param sampler: ``"grid"``, ``"tpe"`` or ``"random"``
+    :param pruner: ``"none"``, ``"median"``, ``"halving"`` or ``"hyperband"``
+    :param compute: how trials store their layers, so that they can be repeated; None: as the run
+        says
+    :raises ConfigError: if these do not go together
+    """
+
+    run: Run
+    space: Space
+    seeds: int
+    sampler: str
+    pruner: str
+    compute: str | None
+
+    def __post_init__(self) -> None:
+        check_space(self.space, self.run)
+        self.make_sampler()
+        self.make_pruner()
+
+    @property
+    def trained(self) -> Run:
+        """The run as trials train it, but for the sampled values."""
+        return (
+            self.run if self.compute is None else with_values(self.run, {"compute": self.compute})
+        )
+
+    @property
+    def method(self) -> str:
+        """The method that is tuned."""
+        return method_of(self.run.settings())
+
+    @property
+    def default_name(self) -> str:
+        """A study's name where the user gives none."""
+        sparsity = policy_kwargs_of(self.run.settings())["sparsity"]
+        shares = sparsity.values() if isinstance(sparsity, Mapping) else [sparsity]
+        parts = [self.run.algo, self.run.env_id.replace("/", "-"), self.method]
+        if self.method != "dense":
+            parts += [f"{share:g}" for share in shares]
+        return "_".join([*parts, self.space.name])
+
+    def trials(self, wanted: int | None) -> int:
+        """How many trials the study shall have.
+
+        :param wanted: None: every cell of a grid, else 100
+        :raises ConfigError: for less than 1, or more than a grid has cells
+        """
+        grid = self.space.grid if self.sampler == "grid" else None
+        cells = prod(len(choices) for choices in grid.values()) if grid else None
+        if wanted is None:
+            return cells or DEFAULT_TRIALS
+        if wanted < 1 or (cells is not None and wanted > cells):
+            most = f"at most {cells}, the cells of the grid" if cells else "as many as you like"
+            raise ConfigError(f"trials must be 1 or more, and {most}; got {wanted}")
+        return wanted
+
+    def ticket(self, number: int) -> dict[str, Any]:
+        """System attributes of the waiting trial of that number, as Optuna's samplers read them."""
+        if self.sampler != "grid":
+            return {}
+        return {"grid_id": number, "search_space": self.space.grid}
+
+    def make_sampler(self) -> optuna.samplers.BaseSampler:
+        """The study's sampler."""
+        return sampler_of(self.sampler, self.space, self.run.seed)
+
+    def make_pruner(self) -> optuna.pruners.BasePruner:
+        """The study's pruner."""
+        return pruner_of(self.pruner, planned_evaluations(self.run) * self.seeds)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, from which :meth:`from_dict` makes the same."""
+        return {
+            "run": self.run.as_dict(),
+            "space": self.space.as_dict(),
+            "seeds": self.seeds,
+            "sampler": self.sampler,
+            "pruner": self.pruner,
+            "compute": self.compute,
+            "settings": self.run.settings(),
+            "evaluation": self.run.evaluation(),
+        }
+
+    @staticmethod
+    def from_dict(values: Mapping[str, Any]) -> Definition:
+        """What :meth:`as_dict` described."""
+        space = Space.from_dict(values["space"])
+        run = Run(**values["run"])
+        how = (values[name] for name in ("seeds", "sampler", "pruner", "compute"))
+        return Definition(run, space, *how)
+
+
+def fixed_compute(run: Run) -> str | None:
+    """How the trials of a run shall store their layers, unless the run says it itself.
+
+    What ``compute="auto"`` chooses depends on what it measures, and a sum of other terms first
+    rounds otherwise. So: on non-zeros from 80 % sparsity on; masked below, in pruning (which begins
+    dense) and where there are no kernels.
+
+    :return: ``"sparse"``, ``"masked"``, or None where the run has a choice of its own
+    """
+    kwargs = policy_kwargs_of(run.settings())
+    if "compute" in kwargs:
+        return None
+    sparsity, begins = kwargs["sparsity"], kwargs.get("initial_sparsity")
+    shares = sparsity.values() if isinstance(sparsity, Mapping) else [sparsity]
+    sparse = min(shares) >= SPARSE_FROM and begins is None and why_missing() is None
+    return "sparse" if sparse else "masked"
+
+
+def differences(ours: Mapping[str, Any], theirs: Mapping[str, Any], path: str = "") -> list[str]:
+    """Where two definitions differ, in words; a compute that tuning chose is not compared."""
+    found = []
+    for name in sorted(ours.keys() | theirs.keys()):
+        here, there = ours.get(name), theirs.get(name)
+        if here == there or (name == "compute" and not path):
+            continue
+        if isinstance(here, Mapping) and isinstance(there, Mapping):
+            found += differences(here, there, f"{path}{name}.")
+        else:
+            found.append(f"{path}{name} is {there!r} there and {here!r} now")
+    return found

@@ -1,0 +1,125 @@
+"""What a trial does: train with sampled values, once for each seed."""
+
+from __future__ import annotations
+
+import os
+import platform
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from statistics import fmean
+
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_sparse.errors import ConfigError
+from sb3_sparse.tuning.backend import Trial, optuna
+from sb3_sparse.tuning.spaces import Space, with_values
+from sb3_sparse.zoo.checkpoint import clear_checkpoints
+from sb3_sparse.zoo.evaluation import Evaluation
+from sb3_sparse.zoo.record import write_record
+from sb3_sparse.zoo.results import score_of
+from sb3_sparse.zoo.run import Run
+from sb3_sparse.zoo.train import train
+
+MAX_SEEDS = 1000
+VALUES = "hyperparams"
+
+
+class Objective:
+    """An objective for ``optuna.Study.optimize``, to be maximized.
+
+    A trial samples the space and trains the run with ``seed``, ``seed + 1``, ... one after the
+    other; all trials have the same seeds. Its value is the mean of their scores, each the mean
+    return of the last 10 % of evaluations. After each evaluation it reports the mean over the seeds
+    so far, at steps 1, 2, ... of all its evaluations, and asks the study's pruner.
+
+    Each seed leaves a run's folder in ``folder/<trial number>/<algo>``, and the trial has the user
+    attributes ``hyperparams`` (what was sampled), ``scores`` (one a seed), ``worker`` and
+    ``seconds``.
+
+    :param run: what is tuned
+    :param space: what is sampled; see :func:`sb3_sparse.tuning.space_of`
+    :param seeds: how many runs a trial
+    :param folder: where the trials' folders go
+    :raises ConfigError: for less than one seed, or runs without any evaluation
+    """
+
+    def __init__(
+        self, run: Run, space: Space, seeds: int = 1, folder: Path = Path("logs/tune/trials")
+    ) -> None:
+        if not 1 <= seeds <= MAX_SEEDS:
+            raise ConfigError(f"seeds must lie in [1, {MAX_SEEDS}], got {seeds}")
+        self.run, self.space, self.seeds, self.folder = run, space, seeds, folder
+        self.planned = planned_evaluations(run)
+
+    def __call__(self, trial: Trial) -> float:
+        """Train, and return the mean score of the seeds.
+
+        :raises optuna.TrialPruned: where the study's pruner says so
+        :raises KeyboardInterrupt: after SIGINT or SIGTERM, when the rollout at hand is over
+        """
+        began = time.monotonic()
+        values = self.space.sample(trial)
+        trial.set_user_attr(VALUES, values)
+        run = with_values(self.run, values)
+        trial.set_user_attr("worker", f"{platform.node()}:{os.getpid()}")
+        scores: list[float] = []
+        for seed in range(self.seeds):
+            evaluations = _Report(trial, scores, self.planned, self.seeds)
+            folder = self.folder / str(trial.number)
+            try:
+                outcome = train(
+                    replace(run, seed=run.seed + seed), folder, after_evaluation=evaluations
+                )
+            except optuna.TrialPruned:
+                clear_checkpoints(evaluations.parent.folder)
+                write_record(evaluations.parent.folder, status="pruned", error=None)
+                raise
+            if not outcome.finished:
+                raise KeyboardInterrupt
+            scores.append(score_of(evaluations.returns))
+            trial.set_user_attr("scores", list(scores))
+        trial.set_user_attr("seconds", round(time.monotonic() - began, 1))
+        return fmean(scores)
+
+
+def planned_evaluations(run: Run) -> int:
+    """How many evaluations a run has.
+
+    :raises ConfigError: if there is none
+    """
+    steps, every = run.settings()["n_timesteps"], run.evaluation()["eval_freq"]
+    if steps < every:
+        raise ConfigError(
+            f"a run of {steps} steps that is evaluated every {every} has no score; train longer "
+            "(-n) or evaluate more often (--eval-freq)"
+        )
+    return int(steps // every)
+
+
+class _Report(BaseCallback):
+    """Tells the study of an evaluation, and stops the run where its pruner wants that.
+
+    :param trial: whose run this is
+    :param scores: of its seeds that are done
+    :param planned: evaluations of one seed
+    :param seeds: of the trial
+    """
+
+    parent: Evaluation
+
+    def __init__(self, trial: Trial, scores: Sequence[float], planned: int, seeds: int) -> None:
+        super().__init__()
+        self.trial, self.scores, self.planned, self.seeds = trial, list(scores), planned, seeds
+        self.returns: list[float] = []
+
+    def _on_step(self) -> bool:
+        self.returns.append(float(self.parent.last_mean_reward))
+        if len(self.returns) > self.planned:
+            return True  # PPO's last rollout may pass the end
+        step = len(self.scores) * self.planned + len(self.returns)
+        self.trial.report(fmean([*self.scores, self.returns[-1]]), step)
+        if step < self.planned * self.seeds and self.trial.should_prune():
+            raise optuna.TrialPruned(f"after evaluation {step}")
+        return True

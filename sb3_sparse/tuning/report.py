@@ -1,0 +1,198 @@
+"""One HTML page on studies: history, importances, slices, the best of each method; and a CSV."""
+
+from __future__ import annotations
+
+import csv
+import warnings
+from collections.abc import Callable, Iterable, Sequence
+from html import escape
+from pathlib import Path
+from typing import Any
+
+from sb3_sparse.errors import ConfigError, MissingExtra
+from sb3_sparse.tuning.backend import BaseStorage, FrozenTrial, TrialState, optuna
+from sb3_sparse.tuning.definition import Definition
+from sb3_sparse.tuning.objective import VALUES
+from sb3_sparse.tuning.storage import FOLDER, JOURNAL, open_existing, shown_url
+from sb3_sparse.tuning.study import DEFINITION, definition_of, find_study, standing_of
+from sb3_sparse.zoo.settings import policy_kwargs_of
+
+try:
+    import plotly.io
+    from optuna.visualization import (
+        plot_intermediate_values,
+        plot_optimization_history,
+        plot_param_importances,
+        plot_slice,
+    )
+except ImportError as error:
+    raise MissingExtra("reports on studies", "tune") from error
+
+TOP = 10
+HEIGHT = 420
+STYLE = """
+body { font: 16px/1.5 system-ui, sans-serif; margin: 0 auto; max-width: 70rem; padding: 1rem; }
+table { border-collapse: collapse; display: block; overflow-x: auto; font-size: .9rem; }
+td, th { border-bottom: 1px solid #ccc; padding: .25rem .75rem; text-align: left; }
+td.number { text-align: right; font-variant-numeric: tabular-nums; }
+"""
+FIGURES: dict[str, Callable[[optuna.Study], Any]] = {
+    "Optimization history": plot_optimization_history,
+    "Parameter importances": plot_param_importances,
+    "Slices": plot_slice,
+    "Evaluations while training": plot_intermediate_values,
+}
+
+
+def write_report(studies: Sequence[optuna.Study], storage: BaseStorage, path: Path) -> Path:
+    """Write a page that opens without a network, and beside it a CSV of all trials.
+
+    :param studies: what it is about
+    :param storage: where other studies of the same algorithm and environment are looked up, for the
+        table of the best of each method
+    :param path: of the page; the CSV has its name with ``.csv``
+    :return: the page
+    :raises ConfigError: if a study has no completed trial
+    """
+    for study in studies:
+        if not standing_of(study).complete:
+            raise ConfigError(
+                f"no trial of {study.study_name!r} was completed yet, so there is nothing to report"
+            )
+    parts = [part for study in studies for part in _about(study)]
+    title = "Tuning: " + ", ".join(study.study_name for study in studies)
+    page = (
+        f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        f'<meta name="viewport" content="width=device-width"><title>{escape(title)}</title>'
+        f"<style>{STYLE}</style><script>{plotly.offline.get_plotlyjs()}</script></head>"
+        f"<body><h1>{escape(title)}</h1>\n{_best_by_method(studies, storage)}\n"
+        + "\n".join(parts)
+        + "</body></html>\n"
+    )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(page)
+    _write_csv(studies, path.with_suffix(".csv"))
+    return path
+
+
+def report_on(
+    names: Sequence[str], storage: str | Path | None, log_folder: Path, path: Path | None
+) -> Path:
+    """Write the page on studies by their names.
+
+    :param storage: as in :func:`tune`
+    :param path: of the page; None: ``report.html`` in the first study's folder
+    :return: the page
+    :raises ConfigError: if there is no such study, or no completed trial in one
+    """
+    storage = storage or log_folder / FOLDER / JOURNAL
+    opened = open_existing(storage)
+    studies = [find_study(opened, name, shown_url(storage)) for name in names]
+    folder = log_folder / FOLDER / names[0].replace("/", "-")
+    return write_report(studies, opened, path or folder / "report.html")
+
+
+def _about(study: optuna.Study) -> list[str]:
+    definition, standing = definition_of(study), standing_of(study)
+    pruned = len(standing.done) - len(standing.complete)
+    run = definition.run
+    facts = [
+        f"{run.algo.upper()} on {run.env_id}, {_what(definition)}",
+        f"{run.settings()['n_timesteps']} steps, {definition.seeds} seed(s) a trial",
+        f"sampler {definition.sampler}, pruner {definition.pruner}",
+        f"{len(standing.complete)} completed, {pruned} pruned, {len(standing.failed)} failed, of "
+        f"{standing.planned} planned",
+    ]
+    parts = [f"<h2>{escape(study.study_name)}</h2>", f"<p>{escape('; '.join(facts))}.</p>"]
+    parts += [f"<h3>The {TOP} best trials</h3>", _top(standing.complete)]
+    for title, draw in FIGURES.items():
+        parts += [f"<h3>{title}</h3>", _figure(draw, study)]
+    return parts
+
+
+def _figure(draw: Callable[[optuna.Study], Any], study: optuna.Study) -> str:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+        try:
+            figure = draw(study)
+        except (ValueError, RuntimeError) as error:
+            return f"<p>Not to be had from these trials: {escape(str(error))}</p>"
+    figure.update_layout(height=HEIGHT, title=None)
+    html: str = plotly.io.to_html(figure, full_html=False, include_plotlyjs=False)
+    return html
+
+
+def _what(definition: Definition) -> str:
+    if definition.method == "dense":
+        return "dense"
+    sparsity = policy_kwargs_of(definition.run.settings())["sparsity"]
+    share = f"{sparsity:.0%}" if isinstance(sparsity, float) else str(sparsity)
+    return f"{definition.method} at {share}"
+
+
+def _top(trials: Sequence[FrozenTrial]) -> str:
+    best = sorted(trials, key=lambda trial: -trial.values[0])[:TOP]
+    names = sorted({name for trial in best for name in trial.params})
+    rows = [
+        [trial.number, trial.values[0], _scores(trial), *(trial.params.get(n, "") for n in names)]
+        for trial in best
+    ]
+    return _table(["trial", "score", "score of each seed", *names], rows)
+
+
+def _scores(trial: FrozenTrial) -> str:
+    return ", ".join(f"{score:.6g}" for score in trial.user_attrs.get("scores", []))
+
+
+def _best_by_method(studies: Sequence[optuna.Study], storage: BaseStorage) -> str:
+    tasks = {_task(definition_of(study)) for study in studies}
+    rows = []
+    for summary in storage.get_all_studies():
+        if DEFINITION not in summary.user_attrs:
+            continue
+        study = optuna.load_study(storage=storage, study_name=summary.study_name)
+        definition, standing = definition_of(study), standing_of(study)
+        if _task(definition) not in tasks or standing.best is None:
+            continue
+        values = standing.best.user_attrs[VALUES]
+        row = [*_task(definition), _what(definition), standing.best.values[0]]
+        shown = ", ".join(f"{name} {value}" for name, value in values.items())
+        row += [shown, f"{len(standing.complete)} of {standing.planned}", definition.seeds]
+        rows.append([*row, study.study_name])
+    heads = ["algorithm", "environment", "steps", "method", "best score", "with", "completed"]
+    table = _table([*heads, "seeds a trial", "study"], sorted(rows, key=str))
+    return f"<h2>Best of each method</h2>\n{table}"
+
+
+def _task(definition: Definition) -> tuple[str, str, int]:
+    run = definition.run
+    return run.algo, run.env_id, run.settings()["n_timesteps"]
+
+
+def _table(heads: Iterable[str], rows: Iterable[Iterable[Any]]) -> str:
+    head = "".join(f"<th>{escape(text)}</th>" for text in heads)
+    body = "".join(f"<tr>{''.join(map(_cell, row))}</tr>\n" for row in rows)
+    return f"<table><thead><tr>{head}</tr></thead>\n<tbody>{body}</tbody></table>"
+
+
+def _cell(value: Any) -> str:
+    if isinstance(value, float):
+        return f'<td class="number">{value:.6g}</td>'
+    return f"<td>{escape(str(value))}</td>"
+
+
+def _write_csv(studies: Sequence[optuna.Study], path: Path) -> None:
+    """A row a trial: what it was, its values, score, scores of the seeds, seconds."""
+    trials = [(study, trial) for study in studies for trial in standing_of(study).all]
+    names = sorted({name for _, trial in trials for name in trial.params})
+    heads = ["study", "trial", "state", "score", *names, "scores", "evaluations", "seconds"]
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(heads)
+        for study, trial in trials:
+            value = trial.values[0] if trial.state == TrialState.COMPLETE else ""
+            params = [trial.params.get(name, "") for name in names]
+            row = [study.study_name, trial.number, trial.state.name.lower(), value, *params]
+            scores = " ".join(f"{score:.6g}" for score in trial.user_attrs.get("scores", []))
+            seconds = trial.user_attrs.get("seconds", "")
+            writer.writerow([*row, scores, len(trial.intermediate_values), seconds])

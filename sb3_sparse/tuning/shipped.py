@@ -1,0 +1,70 @@
+"""The paper's grid, and a wide continuous space around it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from sb3_sparse.sparsity.budgets import feasible_actor_share
+from sb3_sparse.topology import method_named
+from sb3_sparse.tuning.backend import BaseDistribution
+from sb3_sparse.tuning.spaces import (
+    CategoricalDistribution,
+    FloatDistribution,
+    IntDistribution,
+    Space,
+)
+from sb3_sparse.zoo.run import DENSE
+
+WEIGHT_DECAY = (0.0, 1e-6, 1e-4, 1e-3)
+UPDATE_INTERVAL = (100, 250, 500, 1000, 5000)
+DROP_FRACTION = (0.0, 0.1, 0.2, 0.3, 0.5)
+SPARSITY_AWARE_INIT = (True, False)
+ACTOR_SHARE = (0.05, 0.6)
+
+
+def paper_space(method: str) -> Space:
+    """The paper's grid, of what the method has.
+
+    :param method: ``"dense"`` or a topology method
+    :raises ConfigError: for an unknown method
+
+    Source: arXiv:2206.10369, appendix "Hyper-parameter sweep".
+    """
+    searched: dict[str, BaseDistribution] = {"weight_decay": CategoricalDistribution(WEIGHT_DECAY)}
+    if method == DENSE:
+        return Space("paper", searched)
+    topology = method_named(method)
+    if "update_interval" in topology.options:
+        searched["update_interval"] = CategoricalDistribution(UPDATE_INTERVAL)
+    if "drop_fraction" in topology.options:
+        searched["drop_fraction"] = CategoricalDistribution(DROP_FRACTION)
+    if not topology.reaches_final:  # what starts dense has no sparse initialisation
+        searched["sparsity_aware_init"] = CategoricalDistribution(SPARSITY_AWARE_INIT)
+    return Space("paper", searched)
+
+
+def wide_space(method: str, sizes: Mapping[str, int], sparsity: float | None) -> Space:
+    """A continuous space around the paper's grid, of what the method and the policy have.
+
+    :param method: ``"dense"`` or a topology method
+    :param sizes: connections of each dense network of the policy, by name
+    :param sparsity: of all of them; None: of each its own, so that nothing can be shared out
+    :raises ConfigError: for an unknown method
+    """
+    searched: dict[str, BaseDistribution] = {
+        "weight_decay": FloatDistribution(1e-7, 1e-2, log=True),
+        "learning_rate": FloatDistribution(1e-5, 1e-2, log=True),
+    }
+    if method == DENSE:
+        return Space("wide", searched)
+    topology = method_named(method)
+    if "update_interval" in topology.options:
+        searched["update_interval"] = IntDistribution(50, 10_000, log=True)
+    if "drop_fraction" in topology.options:
+        searched["drop_fraction"] = FloatDistribution(0.0, 0.5)
+    searched["distribution"] = CategoricalDistribution(("erk", "uniform"))
+    if sizes.keys() == {"actor", "critic"} and sparsity is not None:
+        low, high = feasible_actor_share(sizes["actor"], sizes["critic"], sparsity)
+        low, high = max(low, ACTOR_SHARE[0]), min(high, ACTOR_SHARE[1])
+        searched["actor_share"] = FloatDistribution(round(low + 5e-5, 4), round(high - 5e-5, 4))
+    return Space("wide", searched)

@@ -1,0 +1,91 @@
+"""Search spaces by name or from a user's file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from sb3_sparse.errors import ConfigError
+from sb3_sparse.tuning.backend import BaseDistribution
+from sb3_sparse.tuning.shipped import paper_space, wide_space
+from sb3_sparse.tuning.spaces import (
+    CategoricalDistribution,
+    FloatDistribution,
+    IntDistribution,
+    Space,
+    run_code,
+)
+from sb3_sparse.zoo.configs import read_yaml
+from sb3_sparse.zoo.match import untrained_policy
+from sb3_sparse.zoo.prepare import prepare
+from sb3_sparse.zoo.run import Run
+from sb3_sparse.zoo.settings import method_of
+
+SHIPPED = ("paper", "wide")
+
+
+def space_of(what: str, run: Run) -> Space:
+    """A shipped space for a run, or the user's own from a file.
+
+    A YAML file maps names to lists of choices or to ``{low: .., high: .., log: true, step: ..}``; a
+    Python file defines ``space``, such a mapping or a function of an Optuna trial that returns the
+    values by name.
+
+    :param what: ``"paper"``, ``"wide"`` or a path
+    :param run: what is to be tuned
+    :raises ConfigError: if there is no such space, or something is wrong with it
+    """
+    method = method_of(run.settings())
+    if what == "paper":
+        return paper_space(method)
+    if what == "wide":
+        return _wide(run, method)
+    path = Path(what)
+    if path.suffix in (".yml", ".yaml"):
+        content = read_yaml(path, "hyperparameters to choices")
+        return Space(path.stem, _distributions(content, path.name))
+    if path.suffix != ".py":
+        raise ConfigError(
+            f"unknown search space {what!r}; allowed are {', '.join(SHIPPED)}, or a file of your "
+            "own, .yml or .py (docs/tuning.md)"
+        )
+    if not path.is_file():
+        raise ConfigError(f"there is no search space {path}")
+    code = path.read_text()
+    found = run_code(code, path.name)
+    if isinstance(found, Mapping):
+        return Space(path.stem, _distributions(found, path.name))
+    return Space(path.stem, code=code)
+
+
+def _wide(run: Run, method: str) -> Space:
+    prepared = prepare(run, Path("logs"))
+    policy = untrained_policy(
+        run.algorithm, prepared.observation_space, prepared.action_space, prepared.settings
+    )
+    sizes = {network.name: network.size for network in policy.sparse.networks}
+    sparsity = policy.sparsity_config.sparsity
+    return wide_space(method, sizes, sparsity if isinstance(sparsity, float) else None)
+
+
+def _distributions(content: Mapping[str, Any], name: str) -> dict[str, BaseDistribution]:
+    return {str(key): _distribution(str(key), value, name) for key, value in content.items()}
+
+
+def _distribution(key: str, value: Any, name: str) -> BaseDistribution:
+    if isinstance(value, BaseDistribution):
+        return value
+    try:
+        if isinstance(value, (list, tuple)):
+            return CategoricalDistribution(value)
+        if isinstance(value, Mapping):
+            ends = [value.get("low"), value.get("high")]
+            whole = all(type(end) is int for end in ends)
+            return IntDistribution(**value) if whole else FloatDistribution(**value)
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"{key} in {name}: {error}") from error
+    raise ConfigError(
+        f"{key} in {name} must be a list of choices, or a mapping with low and high (and log, "
+        f"step), got {value!r}"
+    )

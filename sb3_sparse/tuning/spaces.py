@@ -1,0 +1,155 @@
+"""What is searched: hyperparameters and where each may lie."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from sb3_sparse.errors import ConfigError
+from sb3_sparse.topology import method_named
+from sb3_sparse.tuning.backend import BaseDistribution, Trial, optuna
+from sb3_sparse.zoo.run import DENSE, Run
+from sb3_sparse.zoo.settings import method_of
+
+CategoricalDistribution = optuna.distributions.CategoricalDistribution
+FloatDistribution = optuna.distributions.FloatDistribution
+IntDistribution = optuna.distributions.IntDistribution
+
+OF_SPARSE_POLICIES = frozenset({"sparsity", "distribution", "actor_share", "sparsity_aware_init"})
+OF_METHODS = frozenset({"update_interval", "drop_fraction", "begin", "end", "update_on"})
+
+
+@dataclass(frozen=True)
+class Space:
+    """Hyperparameters to search, by the names that ``--hyperparams`` knows.
+
+    :param name: for the study's name and messages
+    :param distributions: Optuna's distribution of each; empty where ``code`` says how to sample
+    :param code: Python source that defines ``space``, a function of an Optuna trial that returns
+        the values by name
+    :raises ConfigError: for an empty space
+    """
+
+    name: str
+    distributions: Mapping[str, BaseDistribution] = field(default_factory=dict)
+    code: str | None = None
+
+    def __post_init__(self) -> None:
+        if not self.distributions and self.code is None:
+            raise ConfigError(
+                f"the search space {self.name!r} is empty: it must name at least one "
+                "hyperparameter, e.g. weight_decay: [0.0, 1.0e-4]"
+            )
+
+    def sample(self, trial: Trial) -> dict[str, Any]:
+        """Values for a trial, by name.
+
+        :raises ConfigError: if the user's function fails or returns no mapping
+        """
+        if self.code is not None:
+            return self._call(trial)
+        return {name: _suggest(trial, name, d) for name, d in self.distributions.items()}
+
+    def _call(self, trial: Trial) -> dict[str, Any]:
+        values = run_code(str(self.code), self.name)(trial)
+        if not isinstance(values, Mapping) or not values:
+            raise ConfigError(
+                f"space(trial) in {self.name} must return the sampled values by name, e.g. "
+                "{'weight_decay': trial.suggest_float('weight_decay', 1e-7, 1e-2)}, got "
+                f"{values!r}"
+            )
+        return dict(values)
+
+    @property
+    def grid(self) -> dict[str, list[Any]] | None:
+        """The choices of each hyperparameter, where all have choices; else None."""
+        if not self.distributions:
+            return None
+        choices = {}
+        for name, distribution in self.distributions.items():
+            if not isinstance(distribution, CategoricalDistribution):
+                return None
+            choices[name] = list(distribution.choices)
+        return choices
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values that two equal spaces have in common."""
+        to_json = optuna.distributions.distribution_to_json
+        texts = {name: to_json(d) for name, d in sorted(self.distributions.items())}
+        return {"name": self.name, "code": self.code, "distributions": texts}
+
+    @staticmethod
+    def from_dict(values: Mapping[str, Any]) -> Space:
+        """The space that :meth:`as_dict` described."""
+        of = optuna.distributions.json_to_distribution
+        return Space(
+            values["name"],
+            {name: of(text) for name, text in values["distributions"].items()},
+            values["code"],
+        )
+
+
+def _suggest(trial: Trial, name: str, distribution: BaseDistribution) -> Any:
+    if isinstance(distribution, CategoricalDistribution):
+        return trial.suggest_categorical(name, distribution.choices)
+    assert isinstance(distribution, (FloatDistribution, IntDistribution))
+    low, high, log = distribution.low, distribution.high, distribution.log
+    if isinstance(distribution, IntDistribution):
+        return trial.suggest_int(name, int(low), int(high), step=distribution.step, log=log)
+    return trial.suggest_float(name, low, high, step=distribution.step, log=log)
+
+
+def run_code(code: str, name: str) -> Any:
+    """What a Python source defines as ``space``.
+
+    :param name: of the file, for messages
+    :raises ConfigError: if it fails, or defines nothing of that kind
+    """
+    names: dict[str, Any] = {"__name__": "space"}
+    try:
+        exec(compile(code, name, "exec"), names)
+    except Exception as error:
+        raise ConfigError(f"{name} fails: {type(error).__name__}: {error}") from error
+    found = names.get("space")
+    if not (isinstance(found, Mapping) or callable(found)):
+        raise ConfigError(
+            f"{name} must define `space`: a mapping of hyperparameters to choices, or a function "
+            f"of an Optuna trial that returns them; got {found!r}"
+        )
+    return found
+
+
+def with_values(run: Run, values: Mapping[str, Any]) -> Run:
+    """The run with sampled values for its hyperparameters."""
+    return replace(run, hyperparams={**run.hyperparams, **values})
+
+
+def check_space(space: Space, run: Run) -> None:
+    """Refuse a space that the run has no place for, before anything is trained.
+
+    A trial is sampled on the side, and its settings are made.
+
+    :raises ConfigError: for a name that the algorithm, the policy or the method does not have, or
+        one that the run itself has fixed
+    """
+    study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
+    values = space.sample(study.ask())
+    fixed = {**run.hyperparams, "sparsity": run.sparsity, "distribution": run.distribution}
+    for name in values:
+        if fixed.get(name) is not None:
+            raise ConfigError(
+                f"the search space {space.name!r} varies {name}, which is also fixed to "
+                f"{fixed[name]!r}; drop one of the two"
+            )
+    method = method_of(run.settings())
+    if method == DENSE:
+        absent = (OF_SPARSE_POLICIES | OF_METHODS) & values.keys()
+    else:
+        absent = (OF_METHODS & values.keys()) - method_named(method).options
+    if absent:
+        raise ConfigError(
+            f"method {method!r} has no {', '.join(sorted(absent))}, which the search space "
+            f"{space.name!r} varies; leave it out there, or tune another method"
+        )
+    with_values(run, values).settings()

@@ -1,0 +1,196 @@
+"""Where studies are kept: a journal file, or whatever database Optuna has a URL for."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from optuna.storages import JournalStorage, RDBStorage, RetryHeartbeatStaleTrialCallback
+from optuna.storages._heartbeat import BaseHeartbeat
+from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
+
+from sb3_sparse.errors import ConfigError, MissingExtra
+from sb3_sparse.tuning.backend import BaseStorage, FrozenTrial, TrialState, optuna
+
+HEARTBEAT = 30
+FOLDER = "tune"
+JOURNAL = "journal.log"
+StaleCallback = Callable[["optuna.Study", FrozenTrial], None]
+
+
+class QueueEmpty(Exception):
+    """There is no trial left to take."""
+
+
+class _FromQueue(BaseStorage):
+    """Gives out the trials that wait in a study, and never makes one for a worker that asks.
+
+    A study holds its whole budget as waiting trials. Taking one is atomic in every storage, so no
+    trial is trained twice, whatever the sampler and however many workers there are.
+    """
+
+    def create_new_trial(self, study_id: int, template_trial: FrozenTrial | None = None) -> int:
+        """As in Optuna, but only with a template.
+
+        :raises QueueEmpty: without
+        """
+        if template_trial is None:
+            raise QueueEmpty
+        return super().create_new_trial(study_id, template_trial)  # type: ignore[safe-super]
+
+
+class QueueDatabase(_FromQueue, RDBStorage):
+    """A database behind SQLAlchemy."""
+
+
+class QueueJournal(_FromQueue, JournalStorage, BaseHeartbeat):
+    """A journal file, with what Optuna has for databases alone: signs of life.
+
+    A worker touches a file of its trial in ``<journal>.alive/``; a trial whose file has not been
+    touched for ``3 * interval`` is stale.
+
+    :param path: of the journal
+    :param interval: seconds between two signs of life
+    :param stale: called with each trial that is found stale
+    """
+
+    def __init__(self, path: Path, interval: int, stale: StaleCallback) -> None:
+        self._alive = path.with_name(f"{path.name}.alive")
+        self._alive.mkdir(parents=True, exist_ok=True)
+        lock = JournalFileOpenLock(str(path)) if os.name == "nt" else None
+        super().__init__(JournalFileBackend(str(path), lock))
+        self._interval, self._stale = interval, stale
+
+    def record_heartbeat(self, trial_id: int) -> None:
+        """Touch the trial's file."""
+        (self._alive / str(trial_id)).touch()
+
+    def _get_stale_trial_ids(self, study_id: int) -> list[int]:
+        clock = self._alive / f"clock-{os.getpid()}"
+        clock.touch()  # the clock of the file system, whichever machine asks
+        now = clock.stat().st_mtime
+        clock.unlink(missing_ok=True)
+        running = self.get_all_trials(study_id, deepcopy=False, states=(TrialState.RUNNING,))
+        return [
+            trial._trial_id
+            for trial in running
+            if now - self._last_sign(trial) > 3 * self._interval
+        ]
+
+    def _last_sign(self, trial: FrozenTrial) -> float:
+        try:
+            return (self._alive / str(trial._trial_id)).stat().st_mtime
+        except FileNotFoundError:  # taken this moment, or killed before its first sign
+            assert trial.datetime_start is not None
+            return trial.datetime_start.timestamp()
+
+    def get_heartbeat_interval(self) -> int | None:
+        """Seconds between two signs of life."""
+        return self._interval
+
+    def get_heartbeat_stale_trial_callback(self) -> StaleCallback | None:
+        """What is called with each stale trial."""
+        return self._stale
+
+    get_failed_trial_callback = get_heartbeat_stale_trial_callback
+
+
+def open_storage(
+    storage: str | Path, heartbeat: int = HEARTBEAT, stale: StaleCallback | None = None
+) -> BaseStorage:
+    """The storage at a path or URL, made if it is new; workers take waiting trials only.
+
+    :param storage: path of a journal file, or a URL of SQLAlchemy's, e.g. ``sqlite:///studies.db``
+        or ``postgresql://user:password@host/database``
+    :param heartbeat: seconds between two signs of life; after three without, a trial is given up
+    :param stale: called with such a trial, beside putting it into the queue again
+    :raises ConfigError: if it cannot be reached; names the URL without its password
+    """
+    again = retry_with(stale)
+    if isinstance(storage, Path) or "://" not in storage:
+        path = Path(storage).absolute()
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            return QueueJournal(path, heartbeat, again)
+        except (OSError, ValueError) as error:
+            raise ConfigError(f"the journal {path} cannot be used: {error}") from error
+    from sqlalchemy.exc import SQLAlchemyError
+
+    url = _url(storage)
+    shown = shown_url(storage)
+    try:
+        return QueueDatabase(
+            url.render_as_string(hide_password=False),
+            heartbeat_interval=heartbeat,
+            grace_period=3 * heartbeat,
+            heartbeat_stale_trial_callback=again,
+            engine_kwargs={} if url.get_backend_name() == "sqlite" else {"pool_pre_ping": True},
+        )
+    except ImportError as error:
+        if url.get_backend_name() == "postgresql":
+            raise MissingExtra(f"the storage {shown}", "postgres") from error
+        raise ConfigError(f"the storage {shown} needs a driver: {error}") from error
+    except (SQLAlchemyError, optuna.exceptions.StorageInternalError) as error:
+        cause = str(getattr(error, "orig", error)).strip().splitlines()
+        raise ConfigError(
+            f"the storage {shown} cannot be reached ({cause[0] if cause else 'no reason given'}); "
+            "check host, port, database and user, or leave --storage out for a journal file"
+        ) from None  # whose text may hold the password
+
+
+def open_existing(storage: str | Path) -> BaseStorage:
+    """A storage to be looked at.
+
+    :raises ConfigError: if there is none, or it cannot be reached
+    """
+    if (isinstance(storage, Path) or "://" not in storage) and not Path(storage).is_file():
+        raise ConfigError(
+            f"there is no journal {storage}; give the --log-folder or --storage that was tuned with"
+        )
+    return open_storage(storage)
+
+
+def retry_with(stale: StaleCallback | None) -> StaleCallback:
+    """A callback that puts a trial into the queue again, and calls ``stale``."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+        retry = RetryHeartbeatStaleTrialCallback()
+
+    def again(study: optuna.Study, trial: FrozenTrial) -> None:
+        retry(study, trial)
+        if stale is not None:
+            stale(study, trial)
+
+    return again
+
+
+def shown_url(storage: str | Path) -> str:
+    """A storage as it may be printed: without password."""
+    if isinstance(storage, Path) or "://" not in storage:
+        return str(storage)
+    url = _url(storage)
+    hidden = {name: "***" if "pass" in name.lower() else value for name, value in url.query.items()}
+    return str(url.set(query=hidden).render_as_string(hide_password=True))
+
+
+def _url(storage: str) -> Any:
+    from sqlalchemy.engine import make_url
+    from sqlalchemy.exc import ArgumentError
+
+    scheme = storage.partition("://")[0]
+    try:
+        url = make_url(storage)
+        known = url.get_backend_name() in ("sqlite", "postgresql", "mysql", "mariadb", "mssql")
+    except ArgumentError:
+        known = False
+    if not known:
+        raise ConfigError(
+            f"a storage {scheme}://... is not known; allowed are a path (a journal file) and URLs "
+            "of SQLAlchemy: sqlite:///file.db, postgresql://user:password@host/database, mysql://..."
+        ) from None
+    if url.drivername == "postgresql":
+        url = url.set(drivername="postgresql+psycopg")
+    return url

@@ -1,0 +1,156 @@
+"""Studies in a storage: made, joined, filled with trials that wait, looked at."""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import dataclass
+from typing import Any
+
+from sb3_sparse.errors import ConfigError
+from sb3_sparse.tuning.backend import BaseStorage, FrozenTrial, TrialState, optuna
+from sb3_sparse.tuning.definition import Definition, differences
+from sb3_sparse.tuning.samplers import TICKET
+
+DEFINITION = "sb3_sparse:definition"
+FILLED = "sb3_sparse:trials"
+ERROR = "error"
+PATIENCE = 30.0
+DONE = (TrialState.COMPLETE, TrialState.PRUNED)
+ALIVE = (TrialState.WAITING, TrialState.RUNNING)
+
+
+def enter_study(
+    storage: BaseStorage, name: str, definition: Definition, trials: int
+) -> optuna.Study:
+    """Make a study, or join the one of that name, and see that all its trials are there.
+
+    Trials that failed wait once more.
+
+    :param trials: how many the study shall have at least
+    :raises ConfigError: if there is another study of that name
+    """
+    wanted = json.loads(json.dumps(definition.as_dict()))
+    try:
+        study = optuna.create_study(storage=storage, study_name=name, direction="maximize")
+    except optuna.exceptions.DuplicatedStudyError:
+        study = optuna.load_study(storage=storage, study_name=name)
+        _wait_until_filled(study)
+        _compare(study, wanted)
+    study.set_user_attr("method", definition.method)
+    study.set_user_attr(DEFINITION, {**wanted, **study.user_attrs.get(DEFINITION, {})})
+    _fill(study, definition_of(study), max(trials, study.user_attrs.get(FILLED, 0)))
+    return study
+
+
+def _wait_until_filled(study: optuna.Study) -> None:
+    """Another process may be at it; if nothing happens, it died and we go on where it was."""
+    seen, since = -1, time.monotonic()
+    while FILLED not in study.user_attrs and time.monotonic() - since < PATIENCE:
+        count = len(study.get_trials(deepcopy=False))
+        if count != seen:
+            seen, since = count, time.monotonic()
+        time.sleep(0.2)
+
+
+def _compare(study: optuna.Study, wanted: dict[str, Any]) -> None:
+    known = study.user_attrs.get(DEFINITION)
+    if known is None and not study.get_trials(deepcopy=False):
+        return  # made by a process that died at once
+    differ = ["it was not made by sb3-sparse"] if known is None else differences(wanted, known)
+    if differ:
+        raise ConfigError(
+            f"there is another study {study.study_name!r} in this storage: {'; '.join(differ)}. "
+            "Give this one a name of its own with --study-name"
+        )
+
+
+def _fill(study: optuna.Study, definition: Definition, trials: int) -> None:
+    known = study.get_trials(deepcopy=False)
+    present = {ticket_of(trial) for trial in known if trial.state in (*DONE, *ALIVE)}
+    for number in range(trials):
+        if number not in present:
+            attributes = {TICKET: number, **definition.ticket(number)}
+            study.add_trial(optuna.create_trial(state=TrialState.WAITING, system_attrs=attributes))
+    if study.user_attrs.get(FILLED) != trials:
+        study.set_user_attr(FILLED, trials)
+
+
+def find_study(storage: BaseStorage, name: str, where: str) -> optuna.Study:
+    """A study that exists.
+
+    :param where: the storage, for the message
+    :raises ConfigError: if there is none of that name, or it is none of this package's
+    """
+    names = [study.study_name for study in storage.get_all_studies()]
+    if name not in names:
+        raise ConfigError(
+            f"there is no study {name!r} in {where}; its studies are "
+            f"{', '.join(sorted(names)) or 'none'}"
+        )
+    study = optuna.load_study(storage=storage, study_name=name)
+    if DEFINITION not in study.user_attrs:
+        raise ConfigError(
+            f"the study {name!r} in {where} was not made by sb3-sparse tune; look at it with "
+            "optuna-dashboard"
+        )
+    return study
+
+
+def definition_of(study: optuna.Study) -> Definition:
+    """What the study is."""
+    return Definition.from_dict(study.user_attrs[DEFINITION])
+
+
+def ticket_of(trial: FrozenTrial) -> int | None:
+    """Which of the study's planned trials this is an attempt at."""
+    number: int | None = trial.system_attrs.get(TICKET)
+    return number
+
+
+@dataclass(frozen=True)
+class Standing:
+    """How far a study is.
+
+    :param all: every trial that was begun, lost and failed attempts too
+    :param planned: trials that it shall have
+    :param done: trials that were completed or pruned, in the order of their numbers
+    :param running: trials at work, or lost without anyone having noticed yet
+    :param failed: last attempts at planned trials, where these failed
+    """
+
+    all: tuple[FrozenTrial, ...]
+    planned: int
+    done: tuple[FrozenTrial, ...]
+    running: tuple[FrozenTrial, ...]
+    failed: tuple[FrozenTrial, ...]
+
+    @property
+    def complete(self) -> tuple[FrozenTrial, ...]:
+        """Trials with a value."""
+        return tuple(trial for trial in self.done if trial.state == TrialState.COMPLETE)
+
+    @property
+    def best(self) -> FrozenTrial | None:
+        """The completed trial of the highest value; the first of several."""
+        return max(self.complete, key=lambda trial: trial.values[0], default=None)
+
+    @property
+    def finished(self) -> bool:
+        """Whether every planned trial is done."""
+        return len(self.done) >= self.planned
+
+
+def standing_of(study: optuna.Study) -> Standing:
+    """How far the study is now."""
+    trials = study.get_trials(deepcopy=False)
+    by_ticket: dict[int | None, FrozenTrial] = {}
+    for trial in trials:
+        by_ticket[ticket_of(trial)] = trial  # the last attempt counts
+    return Standing(
+        all=tuple(trial for trial in trials if trial.state != TrialState.WAITING),
+        planned=study.user_attrs.get(FILLED, 0),
+        done=tuple(trial for trial in trials if trial.state in DONE),
+        running=tuple(trial for trial in trials if trial.state == TrialState.RUNNING),
+        failed=tuple(t for t in by_ticket.values() if t.state == TrialState.FAIL),
+    )

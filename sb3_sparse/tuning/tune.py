@@ -1,0 +1,155 @@
+"""A whole tuning: checks, study, workers, best values."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from platform import node
+from typing import Any
+
+from sb3_sparse.errors import ConfigError
+from sb3_sparse.launch import Launcher, Task, launcher_named
+from sb3_sparse.tuning.backend import FrozenTrial, optuna
+from sb3_sparse.tuning.best import BEST, write_best
+from sb3_sparse.tuning.definition import Definition, fixed_compute
+from sb3_sparse.tuning.spacefile import space_of
+from sb3_sparse.tuning.spaces import Space
+from sb3_sparse.tuning.storage import FOLDER, HEARTBEAT, JOURNAL, open_storage
+from sb3_sparse.tuning.study import Standing, enter_study, standing_of
+from sb3_sparse.zoo.prepare import prepare
+from sb3_sparse.zoo.run import Run
+
+TRIALS = "trials"
+WORK = "sb3_sparse.tuning.worker:work"
+Watcher = Callable[[Standing], None]
+
+
+@dataclass(frozen=True)
+class Tuned:
+    """What came out.
+
+    :param study: Optuna's, to be looked at further
+    :param standing: how far it is
+    :param folder: with the trials' folders, the workers' logs and ``best.yml``
+    :param config: YAML file with the best values; None if no trial was completed
+    :param began: whether anything was left to do
+    :param errors: of workers that ended badly, by name
+    """
+
+    study: optuna.Study
+    standing: Standing
+    folder: Path
+    config: Path | None
+    began: bool
+    errors: Mapping[str, str]
+
+    @property
+    def best(self) -> FrozenTrial | None:
+        """The best trial; its ``params`` are the best values, ``values[0]`` the score."""
+        return self.standing.best
+
+
+def tune(
+    run: Run,
+    space: str | Space = "paper",
+    *,
+    trials: int | None = None,
+    seeds: int = 1,
+    sampler: str | None = None,
+    pruner: str | None = None,
+    name: str | None = None,
+    storage: str | Path | None = None,
+    log_folder: Path = Path("logs"),
+    workers: int = 1,
+    launcher: str | Launcher = "local",
+    heartbeat: int = HEARTBEAT,
+    watch: Watcher | None = None,
+) -> Tuned:
+    """Search hyperparameters; join the study if it exists, and do nothing if it is finished.
+
+    Every planned trial is trained once, however many workers, on however many machines, take part;
+    what a killed worker was at is trained again by another.
+
+    :param run: what is tuned, with the first seed
+    :param space: ``"paper"``, ``"wide"``, a file (:func:`space_of`), or a space
+    :param trials: how many; None: every cell of a grid, else 100
+    :param seeds: runs a trial; its value is their mean score
+    :param sampler: ``"grid"``, ``"tpe"`` or ``"random"``; None: a grid where all parameters have
+        choices, else TPE
+    :param pruner: ``"none"``, ``"median"``, ``"halving"`` or ``"hyperband"``; None: none for a
+        grid, else median
+    :param name: of the study; None: algorithm, environment, method, sparsity and space
+    :param storage: path of a journal file or URL of a database; None: ``tune/journal.log`` in
+        ``log_folder``
+    :param log_folder: where ``tune/<name>`` is made
+    :param workers: how many trials at once
+    :param launcher: ``"local"``, ``"ray"`` or one of one's own
+    :param heartbeat: seconds between two signs of life of a worker; one that gives none for three
+        of them is taken for dead
+    :param watch: called with the study's standing, about once in a second
+    :raises ConfigError: for a value that is not allowed, a storage that cannot be reached, or
+        another study of the same name; before anything is trained
+    """
+    definition = define(run, space, seeds, sampler, pruner, log_folder)
+    name = name or definition.default_name
+    number = definition.trials(trials)
+    storage = storage or log_folder.absolute() / FOLDER / JOURNAL
+    folder = log_folder.absolute() / FOLDER / name.replace("/", "-")
+    opened = open_storage(storage, heartbeat)
+    study = enter_study(opened, name, definition, number)
+    before = standing_of(study)
+    errors: dict[str, str] = {}
+    if not before.finished:
+        tasks = _tasks(storage, name, folder, workers, heartbeat)
+        chosen = launcher_named(launcher) if isinstance(launcher, str) else launcher
+        with closing(chosen.run(tasks, workers)) as endings:
+            for ended in endings:
+                if ended is not None and ended.error is not None:
+                    errors[ended.task.name] = ended.error
+                if watch is not None:
+                    watch(standing_of(study))
+    standing = standing_of(study)
+    config = write_best(study, folder / BEST) if standing.best is not None else None
+    return Tuned(study, standing, folder, config, not before.finished, errors)
+
+
+def define(
+    run: Run,
+    space: str | Space,
+    seeds: int,
+    sampler: str | None,
+    pruner: str | None,
+    log_folder: Path,
+) -> Definition:
+    """The study that :func:`tune` makes, checked; nothing is written."""
+    if run.match_params is not None:
+        raise ConfigError(
+            "--match-params trains one dense network of a given size; tune --method dense, with "
+            "net_arch among the --hyperparams, instead"
+        )
+    prepare(run, log_folder)
+    searched = space_of(space, run) if isinstance(space, str) else space
+    if sampler is None:
+        sampler = "grid" if searched.grid is not None else "tpe"
+    if pruner is None:
+        pruner = "none" if sampler == "grid" else "median"
+    return Definition(run, searched, seeds, sampler, pruner, fixed_compute(run))
+
+
+def _tasks(
+    storage: str | Path, name: str, folder: Path, workers: int, heartbeat: int
+) -> list[Task]:
+    if isinstance(storage, Path) or "://" not in storage:
+        storage = str(Path(storage).absolute())
+    arguments: dict[str, Any] = {
+        "storage": storage,
+        "name": name,
+        "folder": str(folder / TRIALS),
+        "heartbeat": heartbeat,
+    }
+    return [
+        Task(f"worker {n}", WORK, arguments, folder / f"{node()}_{n}.log")
+        for n in range(1, workers + 1)
+    ]

@@ -1,0 +1,90 @@
+"""What one worker does: take trials from a study until there are none."""
+
+from __future__ import annotations
+
+import shutil
+import time
+import traceback
+from pathlib import Path
+
+from sb3_sparse.tuning.backend import FrozenTrial, Trial, optuna
+from sb3_sparse.tuning.objective import Objective
+from sb3_sparse.tuning.storage import HEARTBEAT, QueueEmpty, open_storage, retry_with
+from sb3_sparse.tuning.study import ERROR, definition_of, standing_of
+
+FAILURES = 3
+MOMENT = 1.0
+
+
+class TooManyFailures(Exception):
+    """Trials fail one after the other."""
+
+
+def work(
+    storage: str | Path, name: str, folder: str | Path, heartbeat: int = HEARTBEAT
+) -> dict[str, int]:
+    """Take and train trials until all of the study are done, also those that others lose.
+
+    :param storage: path or URL
+    :param name: of the study
+    :param folder: where the trials' folders go
+    :param heartbeat: seconds between two signs of life
+    :return: how many trials were ``"trained"`` and how many ``"failed"``
+    :raises TooManyFailures: after three failures in a row, with the last one's text
+    :raises KeyboardInterrupt: when stopped; the trial at hand waits again
+    """
+    trials = Path(folder)
+
+    def forget(study: optuna.Study, trial: FrozenTrial) -> None:
+        shutil.rmtree(trials / str(trial.number), ignore_errors=True)
+
+    opened = open_storage(storage, heartbeat, forget)
+    study = optuna.load_study(storage=opened, study_name=name)
+    definition = definition_of(study)
+    study.sampler, study.pruner = definition.make_sampler(), definition.make_pruner()
+    objective = Objective(definition.trained, definition.space, definition.seeds, trials)
+    again = retry_with(forget)
+    counts, in_a_row = {"trained": 0, "failed": 0}, 0
+    while True:
+        attempt = _Attempt(objective)
+        try:
+            study.optimize(attempt, n_trials=1)
+            counts["trained"], in_a_row = counts["trained"] + 1, 0
+        except QueueEmpty:
+            if not standing_of(study).running:
+                return counts
+            time.sleep(MOMENT)  # until the others are done, or are found to be lost
+        except KeyboardInterrupt:
+            if attempt.number is not None:
+                again(study, study.get_trials(deepcopy=False)[attempt.number])
+            raise
+        except Exception as error:
+            if attempt.number is None:
+                raise  # the storage, not a trial
+            counts["failed"], in_a_row = counts["failed"] + 1, in_a_row + 1
+            if in_a_row == FAILURES:
+                raise TooManyFailures(
+                    f"{FAILURES} trials in a row have failed, the last one so: {error}"
+                ) from error
+
+
+class _Attempt:
+    """The objective, noting whose trial it was and what went wrong.
+
+    :param objective: the study's
+    """
+
+    def __init__(self, objective: Objective) -> None:
+        self.objective = objective
+        self.number: int | None = None
+
+    def __call__(self, trial: Trial) -> float:
+        self.number = trial.number
+        try:
+            return self.objective(trial)
+        except optuna.TrialPruned:
+            raise
+        except Exception as error:
+            trial.set_user_attr(ERROR, f"{type(error).__name__}: {error}")
+            traceback.print_exc()
+            raise

@@ -1,0 +1,177 @@
+"""Writing settings as YAML that PyYAML reads, and changing one entry of a file."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping
+from typing import Any
+
+import yaml
+
+from sb3_sparse.errors import ConfigError, MissingExtra
+
+try:
+    from ruamel.yaml import YAML
+    from ruamel.yaml.comments import CommentedMap
+    from ruamel.yaml.representer import RoundTripRepresenter
+except ImportError as error:
+    raise MissingExtra("writing tuned configs", "tune") from error
+
+INDENT = 2
+
+
+class _Representer(RoundTripRepresenter):
+    """Writes floats as YAML 1.1 reads them: ``1.0e-06``, where a bare ``1e-06`` is text."""
+
+    def represent_float(self, value: float) -> Any:
+        text = repr(value)
+        if "e" in text and "." not in text:
+            text = text.replace("e", ".0e")
+        return self.represent_scalar("tag:yaml.org,2002:float", text)
+
+
+_Representer.add_representer(float, _Representer.represent_float)
+
+
+def as_yaml(content: Mapping[str, Any]) -> str:
+    """A mapping as block YAML, with short lists in one line.
+
+    Reads as the same values by YAML 1.1 (PyYAML, so rl-zoo) and 1.2.
+    """
+    writer = YAML()
+    writer.Representer = _Representer
+    writer.indent(mapping=INDENT, sequence=2 * INDENT, offset=INDENT)
+    writer.width = 4096
+    text = io.StringIO()
+    writer.dump(_styled(content), text)
+    return text.getvalue()
+
+
+def _styled(value: Any) -> Any:
+    """The value with lists of plain values marked to stand in one line."""
+    from ruamel.yaml.comments import CommentedSeq
+
+    if isinstance(value, Mapping):
+        return CommentedMap({name: _styled(part) for name, part in value.items()})
+    if isinstance(value, (list, tuple)):
+        items = CommentedSeq(_styled(item) for item in value)
+        if not any(isinstance(item, (Mapping, list, tuple)) for item in value):
+            items.fa.set_flow_style()
+        return items
+    return value
+
+
+def merge_entry(
+    text: str, key: str, settings: Mapping[str, Any], comment: str, mark: str, name: str
+) -> str:
+    """A YAML text in which one top-level entry has the settings, and all else is as it was.
+
+    :param key: of the entry; where there is none, one is added at the end, on top of ``default``
+    :param comment: a line to be put into the entry, in place of one that begins with ``mark``
+    :param name: of the file, for messages
+    :raises ConfigError: if other entries would change with this one, or the text is not understood
+    """
+    lines = text.splitlines()
+    document = YAML().load(text)
+    if key in document:
+        _Entry(lines, document, key).change(settings, comment, mark)
+    else:
+        lines += ["", *_new_entry(document, key, settings, comment)]
+    changed = "\n".join(lines) + "\n"
+    before, after = yaml.safe_load(text), yaml.safe_load(changed)
+    others = [k for k in before if k != key and before[k] != after.get(k)]
+    if others:
+        raise ConfigError(
+            f"{', '.join(others)} in {name} take their values from {key}, and would change with "
+            f"it; give {key} an entry of its own first"
+        )
+    if after[key] != dict(settings):
+        differ = [k for k in {*after[key], *settings} if after[key].get(k) != settings.get(k)]
+        raise ConfigError(
+            f"the entry {key} in {name} cannot be changed to the tuned settings (it would differ "
+            f"in {', '.join(sorted(differ))}); take them from best.yml by hand"
+        )
+    return changed
+
+
+def _new_entry(
+    document: CommentedMap, key: str, settings: Mapping[str, Any], comment: str
+) -> list[str]:
+    default = document.get("default")
+    anchor = None if default is None else default.anchor.value
+    known = dict(default) if anchor else {}
+    own = {name: value for name, value in settings.items() if known.get(name) != value}
+    block = as_yaml({key: own}).splitlines() if own else [f"{key}:"]
+    inside = [f"  # {comment}", *([f"  <<: *{anchor}"] if anchor else [])]
+    return [block[0], *inside, *block[1:]]
+
+
+class _Entry:
+    """One entry's lines, changed in place.
+
+    :param lines: of the whole text
+    :param document: as ruamel.yaml has read it
+    :param key: of the entry
+    """
+
+    def __init__(self, lines: list[str], document: CommentedMap, key: str) -> None:
+        self.lines, self.document, self.key = lines, document, key
+
+    def change(self, settings: Mapping[str, Any], comment: str, mark: str) -> None:
+        """Make the entry say what the settings say."""
+        start = self.document.lc.key(self.key)[0]
+        end = self._end(start)
+        edits = self._edits(self.document[self.key], settings, end)
+        for first, last, new in sorted(edits, key=lambda edit: edit[0], reverse=True):
+            self.lines[first:last] = new
+        if self.lines[start + 1].lstrip("# ").startswith(mark):
+            del self.lines[start + 1]
+        self.lines.insert(start + 1, f"{' ' * INDENT}# {comment}")
+
+    def _edits(
+        self, known: CommentedMap, wanted: Mapping[str, Any], end: int
+    ) -> list[tuple[int, int, list[str]]]:
+        """Lines to replace in a block mapping: first, last + 1, the new ones."""
+        own = [name for name in known if name in known.lc.data]
+        column = min((known.lc.key(name)[1] for name in own), default=INDENT)
+        edits, added = [], []
+        for name, value in wanted.items():
+            if name in known and known[name] == value:
+                continue
+            if name not in own:
+                added += self._dumped(name, value, column)
+                continue
+            first = known.lc.key(name)[0]
+            last, old = self._end(first), known[name]
+            if isinstance(old, CommentedMap) and isinstance(value, Mapping) and last > first + 1:
+                edits += self._edits(old, value, last)
+            else:
+                new = self._dumped(name, value, column)
+                if last == first + 1 and isinstance(old, (bool, int, float)):
+                    new[0] += "".join(self.lines[first].partition("  #")[1:])
+                edits.append((first, last, new))
+        if added:
+            edits.append((end, end, added))
+        return edits
+
+    def _end(self, first: int) -> int:
+        """The line after the last one of the key that stands on a line."""
+        column = _indent(self.lines[first])
+        last = first
+        for number in range(first + 1, len(self.lines)):
+            line = self.lines[number].strip()
+            if not line or line.startswith("#"):
+                continue
+            here = _indent(self.lines[number])
+            if here < column or (here == column and not line.startswith("- ")):
+                break
+            last = number
+        return last + 1
+
+    @staticmethod
+    def _dumped(name: str, value: Any, column: int) -> list[str]:
+        return [" " * column + line for line in as_yaml({name: value}).splitlines()]
+
+
+def _indent(line: str) -> int:
+    return len(line) - len(line.lstrip(" "))

@@ -1,0 +1,92 @@
+"""What is checked of a run before it is trained."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import torch as th
+from gymnasium import spaces
+
+from sb3_sparse.errors import ConfigError, MissingExtra, SparsityError
+from sb3_sparse.zoo.experiment import spaces_of
+from sb3_sparse.zoo.run import Run
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """What is known of a run before it is trained.
+
+    :param settings: as it shall be trained
+    :param evaluation: ``eval_freq`` and ``eval_episodes``
+    :param observation_space: that the policy sees, wrappers and stacking included
+    :param action_space: that it acts in
+    """
+
+    settings: dict[str, Any]
+    evaluation: dict[str, int]
+    observation_space: spaces.Space[Any]
+    action_space: spaces.Space[Any]
+
+
+def prepare(run: Run, log_folder: Path) -> Prepared:
+    """Check a run and make its environment once, without training or writing anything.
+
+    :raises ConfigError: if something is wrong with device, settings or environment, or the
+        algorithm cannot act in it
+    """
+    if run.device.startswith("cuda") and not th.cuda.is_available():
+        raise ConfigError(f"there is no device {run.device!r} here; give --device auto or cpu")
+    settings, evaluation = run.settings(), run.evaluation()
+    with explained(doubt(run), run.env_id):
+        observation_space, action_space = spaces_of(
+            run, settings, log_folder / run.algo / "new", evaluation
+        )
+    check_action_space(run, action_space)
+    return Prepared(settings, evaluation, observation_space, action_space)
+
+
+def doubt(run: Run) -> str:
+    """What to say when an environment or algorithm fails before training."""
+    return f"the settings of {run.env_id} in {run.config}, with what you changed, do not work"
+
+
+@contextmanager
+def explained(failure: str, env_id: str) -> Iterator[None]:
+    """Turn what environment, zoo and algorithm raise before training into one of our errors.
+
+    :param failure: what does not work then
+    """
+    try:
+        yield
+    except SparsityError:
+        raise
+    except gym.error.DependencyNotInstalled as error:
+        if "mujoco" in str(error).lower():
+            raise MissingExtra(env_id, "mujoco") from error
+        raise ConfigError(f"{env_id} cannot be made: {error}") from error
+    except Exception as error:
+        raise ConfigError(f"{failure}: {type(error).__name__}: {error}") from error
+
+
+def check_action_space(run: Run, space: spaces.Space[Any]) -> None:
+    """Refuse an environment whose actions the algorithm cannot choose.
+
+    :raises ConfigError: if so
+    """
+    discrete = isinstance(space, spaces.Discrete)
+    discrete_only = run.algo in ("dqn", "qrdqn")
+    box_only = run.algo in ("sac", "td3", "ddpg", "tqc", "crossq")
+    if (discrete_only and not discrete) or (box_only and not isinstance(space, spaces.Box)):
+        others = (
+            "dqn, qrdqn, ppo, a2c or trpo"
+            if discrete
+            else "sac, td3, ddpg, tqc, crossq, ppo, a2c or trpo"
+        )
+        raise ConfigError(
+            f"{run.algo} cannot act in {run.env_id}, whose actions are {space}; take {others}"
+        )
