@@ -15,6 +15,7 @@ BUDGETS = {
     "dqn_set.py": ["--steps", "2000"],
     "run_from_config.py": ["--steps", "2000"],
     "sparsify_checkpoint.py": ["--steps", "2000"],
+    "tune.py": ["--steps", "2000", "--trials", "2", "--workers", "1"],
 }
 
 
@@ -32,5 +33,5 @@ def test_example(name, tmp_path):
         check=False,
     )
     assert done.returncode == 0, done.stderr
-    assert "sparsity:" in done.stdout
     assert "return " in done.stdout
+    assert "sparsity:" in done.stdout or name == "tune.py"

@@ -111,15 +111,16 @@ def _about(study: optuna.Study) -> list[str]:
 
 
 def _figure(draw: Callable[[optuna.Study], Any], study: optuna.Study) -> str:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
         try:
             figure = draw(study)
         except (ValueError, RuntimeError) as error:
             return f"<p>Not to be had from these trials: {escape(str(error))}</p>"
-    figure.update_layout(height=HEIGHT, title=None)
+    said = [w for w in caught if w.category is UserWarning]
+    figure.update_layout(height=HEIGHT, title=None, margin={"t": 30})
     html: str = plotly.io.to_html(figure, full_html=False, include_plotlyjs=False)
-    return html
+    return html + "".join(f"<p>Optuna says: {escape(str(w.message))}</p>" for w in said)
 
 
 def _what(definition: Definition) -> str:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from optuna.storages import JournalStorage, RDBStorage, RetryHeartbeatStaleTrialCallback
+from optuna.storages._cached_storage import _CachedStorage
 from optuna.storages._heartbeat import BaseHeartbeat
 from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
 
@@ -42,8 +44,8 @@ class _FromQueue(BaseStorage):
         return super().create_new_trial(study_id, template_trial)  # type: ignore[safe-super]
 
 
-class QueueDatabase(_FromQueue, RDBStorage):
-    """A database behind SQLAlchemy."""
+class QueueDatabase(_FromQueue, _CachedStorage):
+    """A database behind SQLAlchemy, wrapped as Optuna wraps it."""
 
 
 class QueueJournal(_FromQueue, JournalStorage, BaseHeartbeat):
@@ -122,13 +124,15 @@ def open_storage(
     url = _url(storage)
     shown = shown_url(storage)
     try:
-        return QueueDatabase(
-            url.render_as_string(hide_password=False),
-            heartbeat_interval=heartbeat,
-            grace_period=3 * heartbeat,
-            heartbeat_stale_trial_callback=again,
-            engine_kwargs={} if url.get_backend_name() == "sqlite" else {"pool_pre_ping": True},
-        )
+        with _no_experimental_warnings():
+            database = RDBStorage(
+                url.render_as_string(hide_password=False),
+                heartbeat_interval=heartbeat,
+                grace_period=3 * heartbeat,
+                heartbeat_stale_trial_callback=again,
+                engine_kwargs={} if url.get_backend_name() == "sqlite" else {"pool_pre_ping": True},
+            )
+        return QueueDatabase(database)
     except ImportError as error:
         if url.get_backend_name() == "postgresql":
             raise MissingExtra(f"the storage {shown}", "postgres") from error
@@ -155,8 +159,7 @@ def open_existing(storage: str | Path) -> BaseStorage:
 
 def retry_with(stale: StaleCallback | None) -> StaleCallback:
     """A callback that puts a trial into the queue again, and calls ``stale``."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+    with _no_experimental_warnings():
         retry = RetryHeartbeatStaleTrialCallback()
 
     def again(study: optuna.Study, trial: FrozenTrial) -> None:
@@ -167,12 +170,21 @@ def retry_with(stale: StaleCallback | None) -> StaleCallback:
     return again
 
 
+@contextmanager
+def _no_experimental_warnings() -> Iterator[None]:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+        yield
+
+
 def shown_url(storage: str | Path) -> str:
     """A storage as it may be printed: without password."""
     if isinstance(storage, Path) or "://" not in storage:
         return str(storage)
     url = _url(storage)
-    hidden = {name: "***" if "pass" in name.lower() else value for name, value in url.query.items()}
+    hidden = {
+        name: "hidden" if "pass" in name.lower() else value for name, value in url.query.items()
+    }
     return str(url.set(query=hidden).render_as_string(hide_password=True))
 
 
@@ -181,6 +193,7 @@ def _url(storage: str) -> Any:
     from sqlalchemy.exc import ArgumentError
 
     scheme = storage.partition("://")[0]
+    shown = f"{scheme}://..." if scheme.replace("+", "").isalnum() else "of this form"
     try:
         url = make_url(storage)
         known = url.get_backend_name() in ("sqlite", "postgresql", "mysql", "mariadb", "mssql")
@@ -188,7 +201,7 @@ def _url(storage: str) -> Any:
         known = False
     if not known:
         raise ConfigError(
-            f"a storage {scheme}://... is not known; allowed are a path (a journal file) and URLs "
+            f"a storage {shown} is not known; allowed are a path (a journal file) and URLs "
             "of SQLAlchemy: sqlite:///file.db, postgresql://user:password@host/database, mysql://..."
         ) from None
     if url.drivername == "postgresql":

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping
 from typing import Any
 
@@ -13,52 +12,32 @@ from sb3_sparse.errors import ConfigError, MissingExtra
 try:
     from ruamel.yaml import YAML
     from ruamel.yaml.comments import CommentedMap
-    from ruamel.yaml.representer import RoundTripRepresenter
 except ImportError as error:
     raise MissingExtra("writing tuned configs", "tune") from error
 
 INDENT = 2
 
 
-class _Representer(RoundTripRepresenter):
-    """Writes floats as YAML 1.1 reads them: ``1.0e-06``, where a bare ``1e-06`` is text."""
+class _Dumper(yaml.SafeDumper):  # type: ignore[misc]
+    """Indents lists below their key; writes those of plain values in one line."""
 
-    def represent_float(self, value: float) -> Any:
-        text = repr(value)
-        if "e" in text and "." not in text:
-            text = text.replace("e", ".0e")
-        return self.represent_scalar("tag:yaml.org,2002:float", text)
+    def increase_indent(self, flow: bool = False, indentless: bool = False) -> Any:
+        return super().increase_indent(flow, False)
+
+    def represent_items(self, items: list[Any] | tuple[Any, ...]) -> yaml.Node:
+        nested = any(isinstance(item, (Mapping, list, tuple)) for item in items)
+        return self.represent_sequence("tag:yaml.org,2002:seq", items, flow_style=not nested)
 
 
-_Representer.add_representer(float, _Representer.represent_float)
+_Dumper.add_representer(list, _Dumper.represent_items)
+_Dumper.add_representer(tuple, _Dumper.represent_items)
 
 
 def as_yaml(content: Mapping[str, Any]) -> str:
-    """A mapping as block YAML, with short lists in one line.
-
-    Reads as the same values by YAML 1.1 (PyYAML, so rl-zoo) and 1.2.
-    """
-    writer = YAML()
-    writer.Representer = _Representer
-    writer.indent(mapping=INDENT, sequence=2 * INDENT, offset=INDENT)
-    writer.width = 4096
-    text = io.StringIO()
-    writer.dump(_styled(content), text)
-    return text.getvalue()
-
-
-def _styled(value: Any) -> Any:
-    """The value with lists of plain values marked to stand in one line."""
-    from ruamel.yaml.comments import CommentedSeq
-
-    if isinstance(value, Mapping):
-        return CommentedMap({name: _styled(part) for name, part in value.items()})
-    if isinstance(value, (list, tuple)):
-        items = CommentedSeq(_styled(item) for item in value)
-        if not any(isinstance(item, (Mapping, list, tuple)) for item in value):
-            items.fa.set_flow_style()
-        return items
-    return value
+    """A mapping of plain values as block YAML, as rl-zoo (PyYAML) reads it."""
+    text = yaml.dump(dict(content), Dumper=_Dumper, sort_keys=False, width=4096, allow_unicode=True)
+    assert isinstance(text, str)
+    return text
 
 
 def merge_entry(
@@ -132,7 +111,7 @@ class _Entry:
         self, known: CommentedMap, wanted: Mapping[str, Any], end: int
     ) -> list[tuple[int, int, list[str]]]:
         """Lines to replace in a block mapping: first, last + 1, the new ones."""
-        own = [name for name in known if name in known.lc.data]
+        own = [name for name in known if name in (known.lc.data or {})]
         column = min((known.lc.key(name)[1] for name in own), default=INDENT)
         edits, added = [], []
         for name, value in wanted.items():

@@ -1,0 +1,207 @@
+"""What a study leaves behind: best values that train as they are, a page, a CSV, progress."""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+import subprocess
+import sys
+from datetime import datetime
+from pathlib import Path
+
+import pytest
+import yaml
+from rich.console import Console
+from tuning_support import choices, small_run
+
+from sb3_sparse.cli.tuneprogress import TuningProgress
+from sb3_sparse.errors import ConfigError
+from sb3_sparse.tuning import tune, write_report
+from sb3_sparse.tuning.backend import TrialState, optuna
+from sb3_sparse.tuning.best import best_settings, write_best, write_into
+from sb3_sparse.tuning.report import report_on
+from sb3_sparse.tuning.storage import open_storage
+from sb3_sparse.tuning.study import TICKET, enter_study, standing_of
+from sb3_sparse.tuning.tune import define
+from sb3_sparse.zoo.configs import config_path
+from sb3_sparse.zoo.run import Run
+from sb3_sparse.zoo.train import train
+
+LOGS = Path("logs")
+SPACE = choices(weight_decay=[0.0, 1e-6, 1e-4], update_interval=[100, 200])
+
+
+def finished(storage, name, value, run=None, space=SPACE, seeds=1):
+    """A study whose trials were not trained: each has the value that a function gives it."""
+    run = run or small_run()
+    definition = define(run, space, seeds, None, None, LOGS)
+    study = enter_study(storage, name, definition, definition.trials(None))
+    study.sampler = definition.make_sampler()
+
+    def objective(trial):
+        sampled = definition.space.sample(trial)
+        trial.set_user_attr("hyperparams", sampled)
+        trial.set_user_attr("scores", [value(sampled)])
+        trial.report(value(sampled), 1)
+        return value(sampled)
+
+    study.optimize(objective, n_trials=definition.trials(None))
+    return study
+
+
+def decay_matters(values) -> float:
+    return 100 - abs(values["weight_decay"] - 1e-6) * 1e5 - values["update_interval"] / 100
+
+
+@pytest.fixture
+def storage(tmp_path):
+    return open_storage(tmp_path / "tune" / "journal.log")
+
+
+@pytest.fixture
+def study(storage):
+    return finished(storage, "mine", decay_matters)
+
+
+def test_the_best_values_are_a_config_that_trains_as_it_is(study, tmp_path):
+    path = write_best(study, tmp_path / "best.yml")
+    first = path.read_text().splitlines()[0]
+    assert re.fullmatch(
+        r"# Tuned by sb3-sparse: study mine, trial \d of 6 trials, score 99, \d{4}-\d\d-\d\d", first
+    )
+    datetime.strptime(first.rpartition(" ")[2], "%Y-%m-%d")
+    content = yaml.safe_load(path.read_text())
+    assert content.keys() == {"CartPole-v1"}
+    entry = content["CartPole-v1"]
+    assert entry == best_settings(study)
+    assert entry["policy_kwargs"]["weight_decay"] == 1e-6
+    assert "compute" not in entry["policy_kwargs"]  # a choice of tuning's
+    assert entry["callback"][0]["sb3_sparse.SparsityCallback"]["update_interval"] == 100
+    outcome = train(Run(conf_file=str(path), eval_freq=300, eval_episodes=1), tmp_path)
+    assert outcome.finished
+    assert outcome.model.policy.optimizer.param_groups[0]["lr"] == 1e-3
+    assert outcome.model.num_timesteps == 600
+    zoo = [sys.executable, "-m", "rl_zoo3.train", "--algo", "dqn", "--env", "CartPole-v1"]
+    subprocess.run([*zoo, "--conf-file", str(path), "-f", "zoo"], cwd=tmp_path, check=True)
+
+
+def test_the_best_values_go_into_one_entry_of_a_config(storage, tmp_path):
+    study = finished(storage, "acrobot", decay_matters, small_run(env_id="Acrobot-v1"))
+    path = tmp_path / "dqn.yml"
+    text = config_path("rigl", "dqn").read_text()
+    path.write_text(text)
+    write_into(study, path)
+    before, after = yaml.safe_load(text), yaml.safe_load(path.read_text())
+    assert after["Acrobot-v1"] == best_settings(study)
+    assert {**after, "Acrobot-v1": None} == {**before, "Acrobot-v1": None}
+    lines = iter(path.read_text().splitlines())
+    assert all(line in lines for line in text.splitlines())  # all are there, in their order
+    assert "Acrobot-v1:\n  # Tuned by sb3-sparse: study acrobot, " in path.read_text()
+
+
+def test_a_config_of_another_method_is_left_alone(study, tmp_path):
+    path = tmp_path / "dqn.yml"
+    path.write_text(config_path("set", "dqn").read_text())
+    with pytest.raises(ConfigError, match="by method 'set', but 'rigl' was tuned"):
+        write_into(study, path)
+    assert path.read_text() == config_path("set", "dqn").read_text()
+
+
+def test_the_page_and_its_csv(study, storage, tmp_path):
+    run = small_run(method="static")
+    finished(storage, "other", lambda v: -1.0, run, choices(weight_decay=[0.0]))
+    finished(storage, "elsewhere", lambda v: 7.0, small_run(env_id="Acrobot-v1"))
+    optuna.create_study(storage=storage, study_name="foreign")
+    page = write_report([study], storage, tmp_path / "page.html").read_text()
+    for title in ("Optimization history", "Parameter importances", "Slices"):
+        assert f"<h3>{title}</h3>" in page
+    assert page.count('class="plotly-graph-div"') == 4
+    assert "src=" not in page[page.index("</head>") :]  # nothing is loaded
+    table = page[page.index("Best of each method") : page.index("<h2>mine</h2>")]
+    rows = re.findall(r"<tr><td>dqn.*?</tr>", table)
+    assert len(rows) == 2
+    assert '<td>rigl at 90%</td><td class="number">99</td>' in rows[0]
+    assert '<td>static at 90%</td><td class="number">-1</td>' in rows[1]
+
+    with (tmp_path / "page.csv").open() as file:
+        trials = list(csv.DictReader(file))
+    assert len(trials) == 6
+    for trial in trials:
+        values = {name: float(trial[name]) for name in ("weight_decay", "update_interval")}
+        assert float(trial["score"]) == pytest.approx(decay_matters(values))
+        assert (trial["study"], trial["state"], trial["evaluations"]) == ("mine", "complete", "1")
+
+
+def test_what_optuna_says_of_a_figure_stands_below_it(storage, tmp_path):
+    one = finished(storage, "one", lambda values: 1.0, space=choices(weight_decay=[0.0]))
+    page = write_report([one], storage, tmp_path / "page.html").read_text()
+    assert "<p>Optuna says: The number of trials is too small to compute importances." in page
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [
+        (["nope"], "there is no study 'nope' in .*journal.log; its studies are foreign, mine, new"),
+        (["foreign"], "'foreign' in .* was not made by sb3-sparse tune; look at it with optuna-d"),
+        (["new"], "no trial of 'new' was completed yet, so there is nothing to report"),
+    ],
+)
+def test_studies_that_cannot_be_reported(study, storage, tmp_path, names, message):
+    optuna.create_study(storage=storage, study_name="foreign")
+    enter_study(storage, "new", define(small_run(), SPACE, 1, None, None, LOGS), 6)
+    with pytest.raises(ConfigError, match=message):
+        report_on(names, None, tmp_path, None)
+
+
+def test_a_journal_that_is_not_there(tmp_path):
+    with pytest.raises(ConfigError, match="there is no journal .*give the --log-folder or"):
+        report_on(["x"], None, tmp_path, None)
+
+
+def test_no_best_without_a_trial(storage, tmp_path):
+    new = enter_study(storage, "new", define(small_run(), SPACE, 1, None, None, LOGS), 6)
+    with pytest.raises(ConfigError, match="no trial of 'new' was completed yet"):
+        write_best(new, tmp_path / "best.yml")
+    assert not (tmp_path / "best.yml").exists()
+
+
+def test_progress_is_a_line_a_trial_with_the_best_so_far(storage):
+    text = io.StringIO()
+    progress = TuningProgress(Console(file=text, width=200))
+    study = enter_study(storage, "new", define(small_run(), SPACE, 1, None, None, LOGS), 6)
+    progress(standing_of(study))
+    for value in (3.0, 1.0):
+        study.optimize(lambda trial, value=value: value, n_trials=1)
+        progress(standing_of(study))
+    with pytest.raises(ZeroDivisionError):
+        study.optimize(lambda trial: 1 / 0, n_trials=1)
+    progress(standing_of(study))
+    progress(standing_of(study))
+    progress.close()
+    assert [line.rstrip(" ;") for line in text.getvalue().splitlines()] == [
+        "1 of 6: trial 0 score 3, best so far 3 (trial 0)",
+        "2 of 6: trial 1 score 1, best so far 3 (trial 0)",
+        "trial 2 failed: no reason known",
+    ]
+
+
+def test_the_last_attempt_at_a_planned_trial_counts(storage):
+    study = enter_study(storage, "new", define(small_run(), SPACE, 1, None, None, LOGS), 1)
+    with pytest.raises(ZeroDivisionError):
+        study.optimize(lambda trial: 1 / 0, n_trials=1)
+    assert len(standing_of(study).failed) == 1
+    waiting = optuna.create_trial(state=TrialState.WAITING, system_attrs={TICKET: 0})
+    study.add_trial(waiting)
+    assert not standing_of(study).failed
+    study.optimize(lambda trial: 5.0, n_trials=1)
+    standing = standing_of(study)
+    assert standing.finished
+    assert standing.best.number == 1
+
+
+def test_tune_is_one_call(tmp_path):
+    tuned = tune(small_run(), choices(weight_decay=[0.0]), log_folder=tmp_path)
+    assert tuned.best.params == {"weight_decay": 0.0}
+    assert tuned.config == tmp_path / "tune" / "dqn_CartPole-v1_rigl_0.9_small" / "best.yml"
+    assert tuned.errors == {}

@@ -1,0 +1,299 @@
+"""Whatever happens to workers, every planned trial is completed once."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sqlite3
+import subprocess
+import sys
+import threading
+import time
+from collections import Counter
+from itertools import product
+
+import pytest
+from tuning_support import choices, small_run
+
+from sb3_sparse.errors import ConfigError
+from sb3_sparse.launch import Launcher
+from sb3_sparse.tuning import tune
+from sb3_sparse.tuning.backend import TrialState, optuna
+from sb3_sparse.tuning.storage import open_storage
+from sb3_sparse.tuning.study import enter_study, standing_of
+from sb3_sparse.tuning.tune import define
+from sb3_sparse.tuning.worker import TooManyFailures, work
+
+GRID = dict(weight_decay=[0.0, 1e-4], update_interval=[100, 200, 400])
+CELLS = {tuple(cell) for cell in product(*GRID.values())}
+
+
+def cell_of(trial) -> tuple[float, int]:
+    return trial.params["weight_decay"], trial.params["update_interval"]
+
+
+def states(study) -> Counter[str]:
+    return Counter(trial.state.name for trial in study.get_trials())
+
+
+@pytest.mark.parametrize("kind", ["journal", "postgres"])
+def test_four_workers_two_of_them_killed_complete_every_cell_once(kind, tmp_path, request):
+    storage = request.getfixturevalue("postgres") if kind == "postgres" else None
+    killed: dict[int, int] = {}
+
+    def kill_two(standing):
+        for trial in standing.running:
+            worker = trial.user_attrs.get("worker")
+            if worker is None or len(killed) == 2:
+                continue
+            pid = int(worker.rpartition(":")[2])
+            if pid not in killed and trial.intermediate_values:
+                os.kill(pid, signal.SIGKILL)
+                killed[pid] = trial.number
+
+    tuned = tune(
+        small_run(n_timesteps=3000),
+        choices(**GRID),
+        storage=storage,
+        log_folder=tmp_path,
+        workers=4,
+        heartbeat=1,
+        watch=kill_two,
+    )
+    assert len(killed) == 2
+    assert sorted(tuned.errors.values()) == ["its process was killed by SIGKILL"] * 2
+    trials = tuned.study.get_trials()
+    done = [trial for trial in trials if trial.state == TrialState.COMPLETE]
+    assert Counter(map(cell_of, done)) == dict.fromkeys(CELLS, 1)
+    assert states(tuned.study) == {"COMPLETE": 6, "FAIL": 2}
+    lost = {trial.number: cell_of(trial) for trial in trials if trial.state == TrialState.FAIL}
+    assert lost.keys() == set(killed.values())
+    again = {trial.system_attrs["failed_trial"]: cell_of(trial) for trial in trials[6:]}
+    assert again == lost
+    folders = {path.name for path in (tuned.folder / "trials").iterdir()}
+    assert folders == {str(trial.number) for trial in done}
+    assert tuned.standing.finished
+
+    more = tune(small_run(n_timesteps=3000), choices(**GRID), storage=storage, log_folder=tmp_path)
+    assert not more.began
+    assert len(more.study.get_trials()) == 8
+    assert more.best.params == tuned.best.params
+
+
+class NoWorkers(Launcher):
+    """Runs nothing, so that a study is made and left."""
+
+    def run(self, tasks, workers):
+        yield from ()
+
+
+def made(tmp_path, space=None, **options):
+    return tune(
+        small_run(),
+        space or choices(**GRID),
+        log_folder=tmp_path,
+        launcher=NoWorkers(),
+        name="study",
+        **options,
+    )
+
+
+def test_a_study_holds_its_whole_budget_and_gives_nothing_else(tmp_path):
+    study = made(tmp_path).study
+    assert states(study) == {"WAITING": 6}
+    journal = tmp_path / "tune" / "journal.log"
+    taken = optuna.load_study(storage=open_storage(journal), study_name="study")
+    taken.optimize(lambda trial: 0.0, n_trials=6)
+    assert states(study) == {"COMPLETE": 6}
+    with pytest.raises(Exception, match="^$"):
+        taken.optimize(lambda trial: 0.0, n_trials=1)
+    assert states(study) == {"COMPLETE": 6}
+
+
+def test_workers_that_take_trials_at_the_same_time_take_different_ones(tmp_path):
+    made(tmp_path, choices(weight_decay=[n * 1e-6 for n in range(40)]))
+    journal = tmp_path / "tune" / "journal.log"
+    taken = []
+
+    def take():
+        study = optuna.load_study(storage=open_storage(journal), study_name="study")
+        for _ in range(10):
+            study.optimize(lambda trial: taken.append(trial.number) or 0.0, n_trials=1)
+
+    threads = [threading.Thread(target=take) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert sorted(taken) == list(range(40))
+
+
+def test_a_trial_is_stale_after_three_missing_signs_and_waits_again(tmp_path):
+    made(tmp_path)
+    storage = open_storage(tmp_path / "tune" / "journal.log", heartbeat=1)
+    study = optuna.load_study(storage=storage, study_name="study")
+    with pytest.warns(UserWarning, match="Heartbeat"):
+        trial = study.ask()
+    storage.record_heartbeat(trial._trial_id)
+    optuna.storages.fail_stale_trials(study)
+    assert states(study) == {"RUNNING": 1, "WAITING": 5}
+    sign = tmp_path / "tune" / "journal.log.alive" / str(trial._trial_id)
+    os.utime(sign, (time.time() - 2.5, time.time() - 2.5))
+    optuna.storages.fail_stale_trials(study)
+    assert states(study) == {"RUNNING": 1, "WAITING": 5}
+    os.utime(sign, (time.time() - 3.5, time.time() - 3.5))
+    optuna.storages.fail_stale_trials(study)
+    assert states(study) == {"FAIL": 1, "WAITING": 6}
+
+
+def test_an_interrupted_study_goes_on_with_the_same_command(tmp_path):
+    args = ["-n", "4000", "--eval-freq", "200", "--eval-episodes", "1", "--workers", "1"]
+    args += ["--space", "space.yml", "-params", "net_arch:[16]", "learning_starts:50"]
+    (tmp_path / "space.yml").write_text("weight_decay: [0.0, 1.0e-4]\n")
+    code = "from sb3_sparse.cli import main; main()"
+    command = [sys.executable, "-c", code, "tune", *args]
+    journal = tmp_path / "logs" / "tune" / "journal.log"
+
+    running = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, text=True)
+    name = "dqn_CartPole-v1_rigl_0.9_space"
+    while True:
+        assert running.poll() is None
+        if journal.exists():
+            seen = optuna.storages.JournalStorage(
+                optuna.storages.journal.JournalFileBackend(str(journal))
+            )
+            names = [study.study_name for study in seen.get_all_studies()]
+            if name in names:
+                study = optuna.load_study(study_name=name, storage=seen)
+                if any(t.intermediate_values for t in study.get_trials(deepcopy=False)):
+                    break
+        time.sleep(0.1)
+    running.send_signal(signal.SIGINT)
+    said, _ = running.communicate(timeout=60)
+    assert running.returncode == 130
+    assert "Interrupted. What was done is kept; the same command goes on." in said
+    found = states(study)
+    assert found["FAIL"] == 1
+    assert found["RUNNING"] == 0
+    assert found["WAITING"] == 2 - found["COMPLETE"]
+
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert f"Study {name}: 2 of 2 trials are done." in done.stdout
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert f"The study {name} is finished: 2 of 2 trials are done. Nothing to do." in done.stdout
+    assert states(study)["COMPLETE"] == 2
+
+
+def test_trials_that_fail_are_noted_and_tried_again_by_the_next_command(tmp_path):
+    space = choices(weight_decay=[-1.0, -2.0, 0.0])  # negative ones are refused
+    made(tmp_path, space)
+    journal = tmp_path / "tune" / "journal.log"
+    assert work(journal, "study", tmp_path / "trials") == {"trained": 1, "failed": 2}
+    study = optuna.load_study(storage=open_storage(journal), study_name="study")
+    standing = standing_of(study)
+    assert [len(standing.done), len(standing.failed)] == [1, 2]
+    assert not standing.finished
+    assert all("weight_decay" in trial.user_attrs["error"] for trial in standing.failed)
+    made(tmp_path, space)
+    assert states(study) == {"COMPLETE": 1, "FAIL": 2, "WAITING": 2}
+
+
+def test_three_failures_in_a_row_end_a_worker(tmp_path):
+    made(tmp_path, choices(weight_decay=[-1.0, -2.0, -3.0, -4.0]))
+    with pytest.raises(TooManyFailures, match="3 trials in a row have failed, the last one so: "):
+        work(tmp_path / "tune" / "journal.log", "study", tmp_path / "trials")
+
+
+def test_a_study_that_was_not_filled_to_its_end_is_filled(tmp_path, monkeypatch):
+    monkeypatch.setattr("sb3_sparse.tuning.study.PATIENCE", 0.5)
+    study = made(tmp_path).study
+    journal = tmp_path / "tune" / "journal.log"
+    lines = journal.read_text().splitlines()
+    journal.write_text("\n".join(lines[:6]) + "\n")  # as a kill would have left it
+    storage = open_storage(journal)
+    assert states(optuna.load_study(storage=storage, study_name="study"))["WAITING"] < 6
+    definition = define(small_run(), choices(**GRID), 1, None, None, tmp_path)
+    study = enter_study(storage, "study", definition, 6)
+    assert states(study) == {"WAITING": 6}
+    grid_ids = {trial.system_attrs["grid_id"] for trial in study.get_trials()}
+    assert grid_ids == set(range(6))
+
+
+def test_more_trials_can_be_asked_for_later(tmp_path):
+    assert states(made(tmp_path, trials=2).study) == {"WAITING": 2}
+    assert states(made(tmp_path, trials=4).study) == {"WAITING": 4}
+    assert states(made(tmp_path, trials=3).study) == {"WAITING": 4}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (dict(seeds=2), "seeds is 1 there and 2 now"),
+        (dict(pruner="median"), "pruner is 'none' there and 'median' now"),
+        (dict(space=choices(weight_decay=[0.0])), r"space.distributions.update_interval is"),
+    ],
+)
+def test_another_study_of_the_same_name_is_refused(tmp_path, change, message):
+    made(tmp_path)
+    with pytest.raises(ConfigError, match=f"another study 'study'.*{message}.*--study-name"):
+        made(tmp_path, **change)
+
+
+def test_a_study_of_somebody_else_is_left_alone(tmp_path, monkeypatch):
+    monkeypatch.setattr("sb3_sparse.tuning.study.PATIENCE", 0.1)
+    (tmp_path / "tune").mkdir()
+    url = f"sqlite:///{tmp_path}/studies.db"
+    study = optuna.create_study(storage=url, study_name="study")
+    study.optimize(lambda trial: trial.suggest_float("x", 0, 1), n_trials=1)
+    with pytest.raises(ConfigError, match="it was not made by sb3-sparse"):
+        made(tmp_path, storage=url)
+    assert len(study.trials) == 1
+
+
+def unreachable():
+    return "postgresql://tuner:s3cret@127.0.0.1:9/studies"
+
+
+@pytest.mark.parametrize(
+    ("storage", "message"),
+    [
+        (unreachable(), r"postgresql\+psycopg://tuner:\*\*\*@127.0.0.1:9/studies cannot be"),
+        (f"{unreachable()}?password=s3cret", "password=hidden cannot be reached"),
+        ("redis://:s3cret@localhost", "a storage redis://... is not known; allowed are"),
+        ("postgres:/s3cret://x", "a storage of this form is not known"),
+    ],
+)
+def test_a_storage_that_cannot_be_reached_is_named_without_its_password(tmp_path, storage, message):
+    with pytest.raises(ConfigError, match=message) as caught:
+        tune(small_run(), choices(**GRID), storage=storage, log_folder=tmp_path)
+    assert "s3cret" not in str(caught.value)
+    assert caught.value.__suppress_context__ or caught.value.__context__ is None
+
+
+def test_sqlite_works_too(tmp_path):
+    url = f"sqlite:///{tmp_path}/studies.db"
+    tuned = tune(
+        small_run(), choices(weight_decay=[0.0]), storage=url, log_folder=tmp_path, heartbeat=1
+    )
+    assert tuned.standing.finished
+    with sqlite3.connect(tmp_path / "studies.db") as database:
+        assert database.execute("select count(*) from trials").fetchone() == (1,)
+
+
+def test_a_damaged_journal_is_named(tmp_path):
+    path = tmp_path / "journal.log"
+    path.write_text("not json\nat all\n")
+    with pytest.raises(ConfigError, match=f"the journal {path} cannot be used"):
+        open_storage(path)
+
+
+def test_ray_completes_every_cell_once(tmp_path):
+    tuned = tune(
+        small_run(),
+        choices(weight_decay=[0.0, 1e-4], update_interval=[100]),
+        log_folder=tmp_path,
+        workers=2,
+        launcher="ray",
+    )
+    assert tuned.errors == {}
+    assert states(tuned.study) == {"COMPLETE": 2}
