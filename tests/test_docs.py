@@ -12,6 +12,9 @@ from support import assert_masked, make
 
 from sb3_sparse import SparsePolicy, cli
 from sb3_sparse.topology import registry
+from sb3_sparse.tuning import space_of
+from sb3_sparse.tuning.spaces import check_space
+from sb3_sparse.tuning.tune import define
 from sb3_sparse.zoo.run import Run
 from sb3_sparse.zoo.train import train
 
@@ -78,10 +81,15 @@ class Enough(Exception):
 
 def train_commands() -> list[str]:
     """Every ``sb3-sparse train`` that the documents show to start a run."""
-    text = "".join((ROOT / path).read_text() for path in ("README.md", "docs/configs.md"))
-    blocks = "".join(re.findall(r"```sh\n(.*?)```", text, re.DOTALL)).replace("\\\n", " ")
-    lines = [line for line in blocks.splitlines() if line.startswith("sb3-sparse train")]
+    lines = [line for line in shell_lines() if line.startswith("sb3-sparse train")]
     return [line for line in lines if "--resume" not in line and "mine.yml" not in line]
+
+
+def shell_lines() -> list[str]:
+    paths = ("README.md", "docs/configs.md", "docs/tuning.md")
+    text = "".join((ROOT / path).read_text() for path in paths)
+    blocks = "".join(re.findall(r"```sh\n(.*?)```", text, re.DOTALL)).replace("\\\n", " ")
+    return blocks.splitlines()
 
 
 @pytest.mark.parametrize("command", train_commands())
@@ -98,6 +106,50 @@ def test_the_train_commands_of_the_documents_have_settings(command, monkeypatch)
         cli.app(words, standalone_mode=False)
     (run,) = runs
     assert run.settings()["n_timesteps"] > 0
+
+
+def tune_commands() -> list[str]:
+    lines = [line for line in shell_lines() if line.startswith("sb3-sparse tune")]
+    return [line for line in lines if "tune report" not in line]
+
+
+@pytest.mark.parametrize("command", tune_commands())
+def test_the_tune_commands_of_the_documents_have_a_study(command, monkeypatch, tmp_path):
+    asked = []
+
+    def note(run, space, **options):
+        asked.append((run, space, options))
+        raise Enough
+
+    monkeypatch.setattr("sb3_sparse.tuning.tune", note)
+    words = shlex.split(command, comments=True)[1:]
+    with pytest.raises(Enough):
+        cli.app(words, standalone_mode=False)
+    ((run, space, options),) = asked
+    chosen = [options[name] for name in ("sampler", "pruner")]
+    definition = define(run, space, options["seeds"], *chosen, tmp_path)
+    assert definition.trials(options["trials"]) > 0
+
+
+def test_the_spaces_of_the_documents_are_spaces(tmp_path):
+    text = (ROOT / "docs/tuning.md").read_text()
+    for kind, suffix in (("yaml", "yml"), ("python", "py")):
+        code = re.findall(rf"```{kind}\n(.*?)```", text, re.DOTALL)[0]
+        path = tmp_path / f"mine.{suffix}"
+        path.write_text(code)
+        check_space(space_of(str(path), Run()), Run())
+
+
+def test_the_script_of_the_tuning_document_runs(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    code = python_blocks("docs/tuning.md")[1]
+    small = code.replace("n_timesteps=50_000", "n_timesteps=2000").replace(
+        "n_trials=10", "n_trials=1"
+    )
+    small = small.replace("seeds=2", "seeds=1").replace("[100, 1000]", "[100]")
+    assert len(code) - len(small) == 2 + 1 + 6
+    exec(compile(small, "docs/tuning.md", "exec"), {})
+    assert "best.yml" in capsys.readouterr().out
 
 
 def test_the_config_of_the_documents_trains(tmp_path):

@@ -109,6 +109,7 @@ def search(
     """
     from sb3_sparse.launch import launcher_named
     from sb3_sparse.tuning import tune
+    from sb3_sparse.tuning.best import check_target
     from sb3_sparse.tuning.best import write_into as merge
 
     run = Run(
@@ -126,8 +127,8 @@ def search(
         eval_episodes=eval_episodes,
         device=device,
     )
-    if write_into is not None and not write_into.is_file():
-        raise typer.BadParameter(f"there is no config {write_into}", param_hint="--write-into")
+    if write_into is not None:
+        check_target(run, write_into)
     progress = TuningProgress(console)
     try:
         tuned = tune(

@@ -13,6 +13,7 @@ from sb3_sparse.tuning.study import definition_of, standing_of
 from sb3_sparse.tuning.yamlfile import as_yaml, merge_entry
 from sb3_sparse.zoo.configs import entry_of
 from sb3_sparse.zoo.environments import is_atari
+from sb3_sparse.zoo.run import Run
 from sb3_sparse.zoo.settings import method_of
 
 BEST = "best.yml"
@@ -63,6 +64,20 @@ def write_best(study: optuna.Study, path: Path) -> Path:
     return path
 
 
+def check_target(run: Run, path: Path) -> None:
+    """Refuse a config that the tuned settings of a run have no place in.
+
+    :raises ConfigError: if there is no such file, or it is for another method
+    """
+    there = method_of(entry_of(path, run.env_id, is_atari(run.env_id)))
+    tuned = method_of(run.settings())
+    if there != tuned:
+        raise ConfigError(
+            f"{path} trains {run.env_id} by method {there!r}, but {tuned!r} is tuned; name the "
+            "file of that method"
+        )
+
+
 def write_into(study: optuna.Study, path: Path) -> None:
     """Merge the best settings into the tuned environment's entry of an existing YAML file.
 
@@ -72,15 +87,11 @@ def write_into(study: optuna.Study, path: Path) -> None:
     :raises ConfigError: if no trial was completed, or the file is for another method or cannot be
         changed without changing what else it says; then it is left as it was
     """
-    definition, settings = definition_of(study), best_settings(study)
-    env_id = definition.run.env_id
-    there = method_of(entry_of(path, env_id, is_atari(env_id)))
-    if there != definition.method:
-        raise ConfigError(
-            f"{path} trains {env_id} by method {there!r}, but {definition.method!r} was tuned; "
-            "name the file of that method"
-        )
-    text = merge_entry(path.read_text(), env_id, settings, describe_best(study), TUNED, str(path))
+    run, settings = definition_of(study).run, best_settings(study)
+    check_target(run, path)
+    text = merge_entry(
+        path.read_text(), run.env_id, settings, describe_best(study), TUNED, str(path)
+    )
     new = path.with_suffix(".new")
     new.write_text(text)
     new.replace(path)

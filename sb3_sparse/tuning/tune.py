@@ -10,7 +10,7 @@ from platform import node
 from typing import Any
 
 from sb3_sparse.errors import ConfigError
-from sb3_sparse.launch import Launcher, Task, launcher_named
+from sb3_sparse.launch import Launcher, Task, check_workers, launcher_named
 from sb3_sparse.tuning.backend import FrozenTrial, optuna
 from sb3_sparse.tuning.best import BEST, write_best
 from sb3_sparse.tuning.definition import Definition, fixed_compute
@@ -92,6 +92,8 @@ def tune(
     :raises ConfigError: for a value that is not allowed, a storage that cannot be reached, or
         another study of the same name; before anything is trained
     """
+    check_workers(workers)
+    chosen = launcher_named(launcher) if isinstance(launcher, str) else launcher
     definition = define(run, space, seeds, sampler, pruner, log_folder)
     name = name or definition.default_name
     number = definition.trials(trials)
@@ -103,7 +105,6 @@ def tune(
     errors: dict[str, str] = {}
     if not before.finished:
         tasks = _tasks(storage, name, folder, workers, heartbeat)
-        chosen = launcher_named(launcher) if isinstance(launcher, str) else launcher
         with closing(chosen.run(tasks, workers)) as endings:
             for ended in endings:
                 if ended is not None and ended.error is not None:

@@ -103,7 +103,7 @@ def test_the_best_values_go_into_one_entry_of_a_config(storage, tmp_path):
 def test_a_config_of_another_method_is_left_alone(study, tmp_path):
     path = tmp_path / "dqn.yml"
     path.write_text(config_path("set", "dqn").read_text())
-    with pytest.raises(ConfigError, match="by method 'set', but 'rigl' was tuned"):
+    with pytest.raises(ConfigError, match="by method 'set', but 'rigl' is tuned"):
         write_into(study, path)
     assert path.read_text() == config_path("set", "dqn").read_text()
 
