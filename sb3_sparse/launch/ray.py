@@ -11,7 +11,8 @@ from typing import Any
 from sb3_sparse.errors import ConfigError, MissingExtra
 from sb3_sparse.launch.base import EVERY, Ended, Launcher, Task, check_workers
 
-PATIENCE = 10.0
+PATIENCE = 10.0  # seconds for a cluster to answer
+GRACE = 60.0  # seconds for a task to stop when it is asked to
 
 
 class RayLauncher(Launcher):
@@ -56,7 +57,9 @@ class RayLauncher(Launcher):
             for reference in running:
                 ray.cancel(reference)  # KeyboardInterrupt in the task
             if running:
-                ray.wait(list(running), num_returns=len(running))
+                _, deaf = ray.wait(list(running), num_returns=len(running), timeout=GRACE)
+                for reference in deaf:
+                    ray.cancel(reference, force=True)
             if ours:
                 ray.shutdown()
 
