@@ -177,9 +177,8 @@ def _print_outcome(run: Run, tuned: Tuned, storage: str | None, log_folder: Path
     if tuned.best is None or tuned.config is None:
         return
     values = values_in_words(tuned.best)
-    console.print(
-        f"Best: [bold]{tuned.best.values[0]:.6g}[/bold], trial {tuned.best.number}: {values}"
-    )
+    score, number = f"[bold]{tuned.best.values[0]:.6g}[/bold]", tuned.best.number
+    console.print(f"Best: {score}, trial {number}: {values}", soft_wrap=True)
     console.print("Train with these values, look at the study:")
     where = [] if storage is None else [f"--storage {_quoted(storage)}"]
     where += [] if log_folder == Path("logs") else [f"--log-folder {log_folder}"]

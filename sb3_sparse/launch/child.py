@@ -29,7 +29,7 @@ def main() -> None:
 
 
 def _stop_at_the_end_of_input() -> None:
-    while sys.stdin.buffer.read(1):
+    while os.read(sys.stdin.fileno(), 1):  # not the buffer, whose lock would be held at exit
         pass
     os.kill(os.getpid(), signal.SIGTERM)
 

@@ -72,7 +72,7 @@ def test_output_goes_to_the_log_and_a_crash_shows_its_last_lines(tmp_path):
         launcher_named("local"), [Task("talks", "subprocess:call", arguments, log)], workers=1
     )
     assert end.value == 0
-    assert {"first", "last"} <= set(log.read_text().split())
+    assert set(log.read_text().split()) == {"first", "last"}
 
 
 def test_closing_stops_what_runs_and_starts_no_more(tmp_path):
