@@ -149,7 +149,7 @@ def test_a_space_that_the_run_has_no_place_for_is_refused(run, space, message):
     [
         ("a.yml", "{}", "the search space 'a' is empty"),
         ("a.yml", "", "must map hyperparameters to choices, got None"),
-        ("a.yml", "weight_decay: []", "weight_decay in a.yml: .*at least one"),
+        ("a.yml", "weight_decay: []", "weight_decay in a.yml: .*one or more"),
         ("a.yml", "weight_decay: 3", "weight_decay in a.yml must be a list of choices, or a map"),
         ("a.yml", "gamma: {low: 1.0}", "gamma in a.yml: .*high"),
         ("a.yml", "gamma: {low: 1.0, high: 0.5}", "gamma in a.yml: .*low.*high"),
