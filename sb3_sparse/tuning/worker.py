@@ -6,11 +6,12 @@ import shutil
 import time
 import traceback
 from pathlib import Path
+from platform import node
 
 from sb3_sparse.tuning.backend import FrozenTrial, Trial, optuna
 from sb3_sparse.tuning.objective import Objective
-from sb3_sparse.tuning.storage import HEARTBEAT, QueueEmpty, open_storage, retry_with
-from sb3_sparse.tuning.study import ERROR, definition_of, standing_of
+from sb3_sparse.tuning.storage import HEARTBEAT, QueueEmpty, open_storage, retry_with, shown_url
+from sb3_sparse.tuning.study import ERROR, definition_of, find_study, standing_of
 
 FAILURES = 3
 MOMENT = 1.0
@@ -30,6 +31,7 @@ def work(
     :param folder: where the trials' folders go
     :param heartbeat: seconds between two signs of life
     :return: how many trials were ``"trained"`` and how many ``"failed"``
+    :raises ConfigError: if this machine does not see the study
     :raises TooManyFailures: after three failures in a row, with the last one's text
     :raises KeyboardInterrupt: when stopped; the trial at hand waits again
     """
@@ -39,7 +41,7 @@ def work(
         shutil.rmtree(trials / str(trial.number), ignore_errors=True)
 
     opened = open_storage(storage, heartbeat, forget)
-    study = optuna.load_study(storage=opened, study_name=name)
+    study = find_study(opened, name, f"{shown_url(storage)} of {node()}")
     definition = definition_of(study)
     study.sampler, study.pruner = definition.make_sampler(), definition.make_pruner()
     objective = Objective(definition.trained, definition.space, definition.seeds, trials)

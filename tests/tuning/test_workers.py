@@ -198,6 +198,11 @@ def test_trials_that_fail_are_noted_and_tried_again_by_the_next_command(tmp_path
     assert states(study) == {"COMPLETE": 1, "FAIL": 2, "WAITING": 2}
 
 
+def test_a_worker_that_does_not_see_the_study_says_so(tmp_path):
+    with pytest.raises(ConfigError, match="there is no study 'study' in .*elsewhere.log of "):
+        work(tmp_path / "elsewhere.log", "study", tmp_path / "trials")
+
+
 def test_three_failures_in_a_row_end_a_worker(tmp_path):
     made(tmp_path, choices(weight_decay=[-1.0, -2.0, -3.0, -4.0]))
     with pytest.raises(TooManyFailures, match="3 trials in a row have failed, the last one so: "):
