@@ -76,13 +76,14 @@ DATABASE = "postgresql://me:s3cret@127.0.0.1:9/x"
         (["--address", "auto"], "add --launcher ray"),
         (["--workers", "0"], "workers must be 1 or more, got 0"),
         (["--sampler", "cma"], "unknown sampler 'cma'"),
+        (["--seeds", "0"], "seeds must lie in [1, 1000], got 0"),
         (["--trials", "999"], "at most 200, the cells of the grid; got 999"),
         (["--write-into", "none.yml"], "there is no config file none.yml"),
         (
             ["-n", "600", "--eval-freq", "601"],
             "a run of 600 steps that is evaluated every 601 has no score",
         ),
-        (["report", "x"], "there is no journal logs/tune/journal.log"),
+        (["report", "x"], "there are no studies in logs/tune/journal.log"),
     ],
 )
 def test_mistakes_are_one_line_and_make_nothing(args, message, tmp_path):

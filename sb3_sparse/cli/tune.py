@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -154,45 +155,42 @@ def search(
     _print_outcome(run, tuned, storage, log_folder)
     if write_into is not None and tuned.best is not None:
         merge(tuned.study, write_into)
-        console.print(f"Merged into {write_into}", soft_wrap=True)
+        _say(f"Merged into {write_into}")
     if not tuned.standing.finished:
         raise typer.Exit(1)
 
 
 def _print_outcome(run: Run, tuned: Tuned, storage: str | None, log_folder: Path) -> None:
+    from sb3_sparse.tuning.urls import shown_url
+
     standing, name = tuned.standing, tuned.study.study_name
     for worker, error in tuned.errors.items():
-        console.print(f"{worker}: {error}", markup=False, soft_wrap=True)
+        _say(f"{worker}: {error.strip().splitlines()[-1]}")
     done = f"{len(standing.done)} of {standing.planned} trials are done"
     if not tuned.began:
-        console.print(f"The study {name} is finished: {done}. Nothing to do.", soft_wrap=True)
+        _say(f"The study {name} is finished: {done}. Nothing to do.")
     elif standing.finished:
-        console.print(f"Study {name}: {done}.", soft_wrap=True)
+        _say(f"Study {name}: {done}.")
     else:
-        console.print(
+        _say(
             f"Study {name}: {done}, {len(standing.failed)} failed; the logs of the workers are in "
-            f"{tuned.folder}. The same command goes on, and tries failed trials again.",
-            soft_wrap=True,
+            f"{tuned.folder}. The same command goes on, and tries failed trials again."
         )
     if tuned.best is None or tuned.config is None:
         return
-    values = values_in_words(tuned.best)
-    score, number = f"[bold]{tuned.best.values[0]:.6g}[/bold]", tuned.best.number
-    console.print(f"Best: {score}, trial {number}: {values}", soft_wrap=True)
-    console.print("Train with these values, look at the study:")
-    where = [] if storage is None else [f"--storage {_quoted(storage)}"]
-    where += [] if log_folder == Path("logs") else [f"--log-folder {log_folder}"]
-    for command in (
-        f"train --algo {run.algo} --env {run.env_id} --conf-file {tuned.config}",
-        " ".join(["tune report", name, *where]),
-    ):
-        console.print(f"sb3-sparse {command}", markup=False, soft_wrap=True)
+    best = tuned.best
+    _say(f"Best: {best.values[0]:.6g}, trial {best.number}: {values_in_words(best)}")
+    _say("Train with these values, look at the study:")
+    where = [] if storage is None else ["--storage", shown_url(storage)]
+    where += [] if log_folder == Path("logs") else ["--log-folder", str(log_folder)]
+    train = ["train", "--algo", run.algo, "--env", run.env_id, "--conf-file", str(tuned.config)]
+    for command in (train, ["tune", "report", name, *where]):
+        _say(shlex.join(["sb3-sparse", *command]))
 
 
-def _quoted(storage: str) -> str:
-    from sb3_sparse.tuning.storage import shown_url
-
-    return f"'{shown_url(storage)}'"
+def _say(text: str) -> None:
+    """A line as it is: names may hold what Rich would take for markup."""
+    console.print(text, markup=False, soft_wrap=True)
 
 
 @tuning.command()
@@ -208,5 +206,5 @@ def report(
     from sb3_sparse.tuning.report import report_on
 
     page = report_on(studies, storage, log_folder, out)
-    console.print(f"Page: {page}", soft_wrap=True)
-    console.print(f"Trials: {page.with_suffix('.csv')}", soft_wrap=True)
+    _say(f"Page: {page}")
+    _say(f"Trials: {page.with_suffix('.csv')}")

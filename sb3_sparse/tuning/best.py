@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -89,9 +90,15 @@ def write_into(study: optuna.Study, path: Path) -> None:
     """
     run, settings = definition_of(study).run, best_settings(study)
     check_target(run, path)
-    text = merge_entry(
-        path.read_text(), run.env_id, settings, describe_best(study), TUNED, str(path)
-    )
-    new = path.with_suffix(".new")
-    new.write_text(text)
-    new.replace(path)
+    text = merge_entry(_read(path), run.env_id, settings, describe_best(study), TUNED, str(path))
+    target = path.resolve()  # behind a link
+    new = target.with_name(f"{target.name}.new")
+    new.write_text(text, newline="")
+    shutil.copymode(target, new)
+    new.replace(target)
+
+
+def _read(path: Path) -> str:
+    """A file's text with its own line endings."""
+    with path.open(newline="") as file:
+        return file.read()

@@ -10,15 +10,16 @@ from typing import Any
 from sb3_sparse.engine.native.library import why_missing
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.tuning.backend import optuna
-from sb3_sparse.tuning.objective import planned_evaluations
+from sb3_sparse.tuning.objective import check_seeds, planned_evaluations
 from sb3_sparse.tuning.samplers import pruner_of, sampler_of
-from sb3_sparse.tuning.spaces import Space, check_space, with_values
+from sb3_sparse.tuning.spaces import Space, check_space, sample_of, with_values
 from sb3_sparse.zoo.run import Run
 from sb3_sparse.zoo.settings import method_of, policy_kwargs_of
 
-ATTRIBUTE = "sb3_sparse"
 SPARSE_FROM = 0.8
 DEFAULT_TRIALS = 100
+# What tuning itself chose, and what the config's file had: that is compared as settings.
+NOT_COMPARED = ("compute", "run.entry")
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,7 @@ class Definition:
     compute: str | None
 
     def __post_init__(self) -> None:
+        check_seeds(self.seeds)
         check_space(self.space, self.run)
         self.make_sampler()
         self.make_pruner()
@@ -99,7 +101,11 @@ class Definition:
         return pruner_of(self.pruner, planned_evaluations(self.run) * self.seeds)
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values, from which :meth:`from_dict` makes the same."""
+        """Plain values, from which :meth:`from_dict` makes the same.
+
+        The settings among them are there to be compared, all with one sample of the space: what is
+        searched may change in the config, e.g. by writing the best values into it.
+        """
         return {
             "run": self.run.as_dict(),
             "space": self.space.as_dict(),
@@ -107,7 +113,7 @@ class Definition:
             "sampler": self.sampler,
             "pruner": self.pruner,
             "compute": self.compute,
-            "settings": self.run.settings(),
+            "settings": with_values(self.run, sample_of(self.space)).settings(),
             "evaluation": self.run.evaluation(),
         }
 
@@ -139,11 +145,11 @@ def fixed_compute(run: Run) -> str | None:
 
 
 def differences(ours: Mapping[str, Any], theirs: Mapping[str, Any], path: str = "") -> list[str]:
-    """Where two definitions differ, in words; a compute that tuning chose is not compared."""
+    """Where two definitions differ, in words."""
     found = []
     for name in sorted(ours.keys() | theirs.keys()):
         here, there = ours.get(name), theirs.get(name)
-        if here == there or (name == "compute" and not path):
+        if here == there or f"{path}{name}" in NOT_COMPARED:
             continue
         if isinstance(here, Mapping) and isinstance(there, Mapping):
             found += differences(here, there, f"{path}{name}.")

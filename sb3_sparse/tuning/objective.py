@@ -48,8 +48,7 @@ class Objective:
     def __init__(
         self, run: Run, space: Space, seeds: int = 1, folder: Path = Path("logs/tune/trials")
     ) -> None:
-        if not 1 <= seeds <= MAX_SEEDS:
-            raise ConfigError(f"seeds must lie in [1, {MAX_SEEDS}], got {seeds}")
+        check_seeds(seeds)
         self.run, self.space, self.seeds, self.folder = run, space, seeds, folder
         self.planned = planned_evaluations(run)
 
@@ -82,6 +81,15 @@ class Objective:
             trial.set_user_attr("scores", list(scores))
         trial.set_user_attr("seconds", round(time.monotonic() - began, 1))
         return fmean(scores)
+
+
+def check_seeds(seeds: int) -> None:
+    """Refuse a number of runs a trial that is none.
+
+    :raises ConfigError: if so
+    """
+    if not 1 <= seeds <= MAX_SEEDS:
+        raise ConfigError(f"seeds must lie in [1, {MAX_SEEDS}], got {seeds}")
 
 
 def planned_evaluations(run: Run) -> int:

@@ -13,8 +13,10 @@ from sb3_sparse.errors import ConfigError, MissingExtra
 from sb3_sparse.tuning.backend import BaseStorage, FrozenTrial, TrialState, optuna
 from sb3_sparse.tuning.definition import Definition
 from sb3_sparse.tuning.objective import VALUES
-from sb3_sparse.tuning.storage import FOLDER, JOURNAL, open_existing, shown_url
+from sb3_sparse.tuning.spaces import with_values
+from sb3_sparse.tuning.storage import FOLDER, JOURNAL, open_existing
 from sb3_sparse.tuning.study import DEFINITION, definition_of, find_study, standing_of
+from sb3_sparse.tuning.urls import shown_url
 from sb3_sparse.zoo.settings import policy_kwargs_of
 
 try:
@@ -97,7 +99,7 @@ def _about(study: optuna.Study) -> list[str]:
     pruned = len(standing.done) - len(standing.complete)
     run = definition.run
     facts = [
-        f"{run.algo.upper()} on {run.env_id}, {_what(definition)}",
+        f"{run.algo.upper()} on {run.env_id}, {_what(definition, standing.best)}",
         f"{run.settings()['n_timesteps']} steps, {definition.seeds} seed(s) a trial",
         f"sampler {definition.sampler}, pruner {definition.pruner}",
         f"{len(standing.complete)} completed, {pruned} pruned, {len(standing.failed)} failed, of "
@@ -123,11 +125,13 @@ def _figure(draw: Callable[[optuna.Study], Any], study: optuna.Study) -> str:
     return html + "".join(f"<p>Optuna says: {escape(str(w.message))}</p>" for w in said)
 
 
-def _what(definition: Definition) -> str:
+def _what(definition: Definition, best: FrozenTrial | None) -> str:
+    """Method and sparsity; where the sparsity is searched, that of the best trial."""
     if definition.method == "dense":
         return "dense"
-    sparsity = policy_kwargs_of(definition.run.settings())["sparsity"]
-    share = f"{sparsity:.0%}" if isinstance(sparsity, float) else str(sparsity)
+    run = definition.run if best is None else with_values(definition.run, best.user_attrs[VALUES])
+    sparsity = policy_kwargs_of(run.settings())["sparsity"]
+    share = f"{100 * sparsity:.4g}%" if isinstance(sparsity, float) else str(sparsity)
     return f"{definition.method} at {share}"
 
 
@@ -156,7 +160,7 @@ def _best_by_method(studies: Sequence[optuna.Study], storage: BaseStorage) -> st
         if _task(definition) not in tasks or standing.best is None:
             continue
         values = standing.best.user_attrs[VALUES]
-        row = [*_task(definition), _what(definition), standing.best.values[0]]
+        row = [*_task(definition), _what(definition, standing.best), standing.best.values[0]]
         shown = ", ".join(f"{name} {value}" for name, value in values.items())
         row += [shown, f"{len(standing.complete)} of {standing.planned}", definition.seeds]
         rows.append([*row, study.study_name])

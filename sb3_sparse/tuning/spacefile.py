@@ -79,13 +79,19 @@ def _distribution(key: str, value: Any, name: str) -> BaseDistribution:
     try:
         if isinstance(value, (list, tuple)):
             return CategoricalDistribution(value)
-        if isinstance(value, Mapping):
-            ends = [value.get("low"), value.get("high")]
-            whole = all(type(end) is int for end in ends)
+        if isinstance(value, Mapping) and _is_range(value):
+            whole = all(type(value[end]) is int for end in ("low", "high"))
             return IntDistribution(**value) if whole else FloatDistribution(**value)
     except (TypeError, ValueError) as error:
         raise ConfigError(f"{key} in {name}: {error}") from error
     raise ConfigError(
-        f"{key} in {name} must be a list of choices, or a mapping with low and high (and log, "
-        f"step), got {value!r}"
+        f"{key} in {name} must be a list of choices, or a range {{low: 0.1, high: 0.5}} of "
+        "numbers, to which log: true or step: 0.1 may be added (YAML reads 1e-6 as text; write "
+        f"1.0e-6), got {value!r}"
     )
+
+
+def _is_range(value: Mapping[str, Any]) -> bool:
+    ends = [value.get(end) for end in ("low", "high")]
+    numbers = all(isinstance(end, (int, float)) and not isinstance(end, bool) for end in ends)
+    return numbers and value.keys() <= {"low", "high", "log", "step"}

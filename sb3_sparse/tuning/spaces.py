@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
+from sb3_sparse.callback import SparsityCallback
 from sb3_sparse.errors import ConfigError
+from sb3_sparse.policies.config import SparsityConfig
 from sb3_sparse.topology import method_named
 from sb3_sparse.tuning.backend import BaseDistribution, Trial, optuna
 from sb3_sparse.zoo.run import DENSE, Run
-from sb3_sparse.zoo.settings import method_of
+from sb3_sparse.zoo.settings import find_callback, method_of, policy_kwargs_of
 
 CategoricalDistribution = optuna.distributions.CategoricalDistribution
 FloatDistribution = optuna.distributions.FloatDistribution
 IntDistribution = optuna.distributions.IntDistribution
 
 OF_SPARSE_POLICIES = frozenset({"sparsity", "distribution", "actor_share", "sparsity_aware_init"})
+OPTIONS = ("sparsity", "distribution", "n_envs")  # of a run, beside its hyperparams
 OF_METHODS = frozenset({"update_interval", "drop_fraction", "begin", "end", "update_on"})
 
 
@@ -125,18 +128,28 @@ def with_values(run: Run, values: Mapping[str, Any]) -> Run:
     return replace(run, hyperparams={**run.hyperparams, **values})
 
 
+def sample_of(space: Space) -> dict[str, Any]:
+    """One sample of a space, always the same."""
+    study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
+    return space.sample(study.ask())
+
+
 def check_space(space: Space, run: Run) -> None:
     """Refuse a space that the run has no place for, before anything is trained.
 
-    A trial is sampled on the side, and its settings are made.
+    Tries a sample, and every choice and both ends of every range in it.
 
-    :raises ConfigError: for a name that the algorithm, the policy or the method does not have, or
-        one that the run itself has fixed
+    :raises ConfigError: for a name that the algorithm, the policy or the method does not have, one
+        that the run itself has fixed, or a value that is not allowed
     """
-    study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
-    values = space.sample(study.ask())
-    fixed = {**run.hyperparams, "sparsity": run.sparsity, "distribution": run.distribution}
+    values = sample_of(space)
+    fixed = {**run.hyperparams, **{name: getattr(run, name) for name in OPTIONS}}
     for name in values:
+        if name == "n_timesteps":
+            raise ConfigError(
+                f"the search space {space.name!r} varies n_timesteps, but trials are compared at "
+                "equal numbers of steps; leave it out and give -n"
+            )
         if fixed.get(name) is not None:
             raise ConfigError(
                 f"the search space {space.name!r} varies {name}, which is also fixed to "
@@ -152,4 +165,23 @@ def check_space(space: Space, run: Run) -> None:
             f"method {method!r} has no {', '.join(sorted(absent))}, which the search space "
             f"{space.name!r} varies; leave it out there, or tune another method"
         )
-    with_values(run, values).settings()
+    _check_settings(with_values(run, values).settings())
+    for name, distribution in space.distributions.items():
+        for value in _extremes(distribution):
+            _check_settings(with_values(run, {**values, name: value}).settings())
+
+
+def _extremes(distribution: BaseDistribution) -> tuple[Any, ...]:
+    if isinstance(distribution, CategoricalDistribution):
+        return distribution.choices
+    assert isinstance(distribution, (FloatDistribution, IntDistribution))
+    return distribution.low, distribution.high
+
+
+def _check_settings(settings: Mapping[str, Any]) -> None:
+    kwargs = policy_kwargs_of(settings)
+    names = {field.name for field in fields(SparsityConfig)}
+    SparsityConfig(**{name: value for name, value in kwargs.items() if name in names})
+    arguments = find_callback(settings)
+    if arguments is not None:
+        SparsityCallback(**arguments)

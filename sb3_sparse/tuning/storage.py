@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import os
+import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Container, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 from optuna.storages import JournalStorage, RDBStorage, RetryHeartbeatStaleTrialCallback
 from optuna.storages._cached_storage import _CachedStorage
@@ -16,10 +16,14 @@ from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
 
 from sb3_sparse.errors import ConfigError, MissingExtra
 from sb3_sparse.tuning.backend import BaseStorage, FrozenTrial, TrialState, optuna
+from sb3_sparse.tuning.samplers import TICKET
+from sb3_sparse.tuning.urls import file_of, is_journal, shown_url, url_of
 
 HEARTBEAT = 30
 FOLDER = "tune"
 JOURNAL = "journal.log"
+OPENINGS = 20
+MOMENT = 0.5
 StaleCallback = Callable[["optuna.Study", FrozenTrial], None]
 
 
@@ -42,6 +46,21 @@ class _FromQueue(BaseStorage):
         if template_trial is None:
             raise QueueEmpty
         return super().create_new_trial(study_id, template_trial)  # type: ignore[safe-super]
+
+    def get_all_trials(
+        self,
+        study_id: int,
+        deepcopy: bool = True,
+        states: Container[TrialState] | None = None,
+    ) -> list[FrozenTrial]:
+        """As in Optuna, but those that wait come in the order that they were planned in.
+
+        So what was lost or interrupted is trained before what has not been begun.
+        """
+        trials = super().get_all_trials(study_id, deepcopy, states)  # type: ignore[safe-super]
+        if states != (TrialState.WAITING,):
+            return trials
+        return sorted(trials, key=lambda trial: trial.system_attrs.get(TICKET, trial.number))
 
 
 class QueueDatabase(_FromQueue, _CachedStorage):
@@ -69,6 +88,15 @@ class QueueJournal(_FromQueue, JournalStorage, BaseHeartbeat):
     def record_heartbeat(self, trial_id: int) -> None:
         """Touch the trial's file."""
         (self._alive / str(trial_id)).touch()
+
+    def set_trial_state_values(
+        self, trial_id: int, state: TrialState, values: Sequence[float] | None = None
+    ) -> bool:
+        """As in Optuna; a trial that is over needs no file."""
+        changed = super().set_trial_state_values(trial_id, state, values)
+        if state.is_finished():
+            (self._alive / str(trial_id)).unlink(missing_ok=True)
+        return changed
 
     def _get_stale_trial_ids(self, study_id: int) -> list[int]:
         clock = self._alive / f"clock-{os.getpid()}"
@@ -112,37 +140,48 @@ def open_storage(
     :raises ConfigError: if it cannot be reached; names the URL without its password
     """
     again = retry_with(stale)
-    if isinstance(storage, Path) or "://" not in storage:
+    if is_journal(storage):
         path = Path(storage).absolute()
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             return QueueJournal(path, heartbeat, again)
         except (OSError, ValueError) as error:
             raise ConfigError(f"the journal {path} cannot be used: {error}") from error
-    from sqlalchemy.exc import SQLAlchemyError
+    return QueueDatabase(_database(str(storage), heartbeat, again))
 
-    url = _url(storage)
-    shown = shown_url(storage)
-    try:
-        with _no_experimental_warnings():
-            database = RDBStorage(
-                url.render_as_string(hide_password=False),
-                heartbeat_interval=heartbeat,
-                grace_period=3 * heartbeat,
-                heartbeat_stale_trial_callback=again,
-                engine_kwargs={} if url.get_backend_name() == "sqlite" else {"pool_pre_ping": True},
-            )
-        return QueueDatabase(database)
-    except ImportError as error:
-        if url.get_backend_name() == "postgresql":
-            raise MissingExtra(f"the storage {shown}", "postgres") from error
-        raise ConfigError(f"the storage {shown} needs a driver: {error}") from error
-    except (SQLAlchemyError, optuna.exceptions.StorageInternalError) as error:
-        cause = str(getattr(error, "orig", error)).strip().splitlines()
-        raise ConfigError(
-            f"the storage {shown} cannot be reached ({cause[0] if cause else 'no reason given'}); "
-            "check host, port, database and user, or leave --storage out for a journal file"
-        ) from None  # whose text may hold the password
+
+def _database(storage: str, heartbeat: int, again: StaleCallback) -> RDBStorage:
+    from sqlalchemy.exc import IntegrityError, OperationalError, ProgrammingError, SQLAlchemyError
+
+    url, shown = url_of(storage), shown_url(storage)
+    alone = url.get_backend_name() == "sqlite"
+    for attempt in range(1, OPENINGS + 1):
+        try:
+            with _no_experimental_warnings():
+                return RDBStorage(
+                    url.render_as_string(hide_password=False),
+                    heartbeat_interval=heartbeat,
+                    grace_period=3 * heartbeat,
+                    heartbeat_stale_trial_callback=again,
+                    engine_kwargs={} if alone else {"pool_pre_ping": True},
+                )
+        except ImportError as error:
+            if url.get_backend_name() == "postgresql":
+                raise MissingExtra(f"the storage {shown}", "postgres") from error
+            raise ConfigError(f"the storage {shown} needs a driver: {error}") from error
+        except (SQLAlchemyError, optuna.exceptions.StorageInternalError) as error:
+            cause = error if isinstance(error, SQLAlchemyError) else error.__cause__
+            busy = "already exists" in str(cause) or "locked" in str(cause)
+            made = isinstance(cause, (IntegrityError, ProgrammingError))
+            if attempt < OPENINGS and (made or (isinstance(cause, OperationalError) and busy)):
+                time.sleep(MOMENT)  # another process is making the same tables
+                continue
+            text = str(getattr(cause, "orig", error)).strip().splitlines()
+            raise ConfigError(
+                f"the storage {shown} cannot be reached ({text[0] if text else 'no reason given'}"
+                "); check what the URL says, or leave --storage out for a journal file"
+            ) from None  # whose text may hold the password
+    raise AssertionError  # the last attempt returns or raises
 
 
 def open_existing(storage: str | Path) -> BaseStorage:
@@ -150,9 +189,11 @@ def open_existing(storage: str | Path) -> BaseStorage:
 
     :raises ConfigError: if there is none, or it cannot be reached
     """
-    if (isinstance(storage, Path) or "://" not in storage) and not Path(storage).is_file():
+    path = file_of(storage)
+    if path is not None and not path.is_file():
         raise ConfigError(
-            f"there is no journal {storage}; give the --log-folder or --storage that was tuned with"
+            f"there are no studies in {path}; give the --log-folder or --storage that was tuned "
+            "with"
         )
     return open_storage(storage)
 
@@ -175,35 +216,3 @@ def _no_experimental_warnings() -> Iterator[None]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
         yield
-
-
-def shown_url(storage: str | Path) -> str:
-    """A storage as it may be printed: without password."""
-    if isinstance(storage, Path) or "://" not in storage:
-        return str(storage)
-    url = _url(storage)
-    hidden = {
-        name: "hidden" if "pass" in name.lower() else value for name, value in url.query.items()
-    }
-    return str(url.set(query=hidden).render_as_string(hide_password=True))
-
-
-def _url(storage: str) -> Any:
-    from sqlalchemy.engine import make_url
-    from sqlalchemy.exc import ArgumentError
-
-    scheme = storage.partition("://")[0]
-    shown = f"{scheme}://..." if scheme.replace("+", "").isalnum() else "of this form"
-    try:
-        url = make_url(storage)
-        known = url.get_backend_name() in ("sqlite", "postgresql", "mysql", "mariadb", "mssql")
-    except ArgumentError:
-        known = False
-    if not known:
-        raise ConfigError(
-            f"a storage {shown} is not known; allowed are a path (a journal file) and URLs "
-            "of SQLAlchemy: sqlite:///file.db, postgresql://user:password@host/database, mysql://..."
-        ) from None
-    if url.drivername == "postgresql":
-        url = url.set(drivername="postgresql+psycopg")
-    return url

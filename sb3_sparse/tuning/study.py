@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,7 +17,7 @@ from sb3_sparse.tuning.samplers import TICKET
 DEFINITION = "sb3_sparse:definition"
 FILLED = "sb3_sparse:trials"
 ERROR = "error"
-PATIENCE = 30.0
+PATIENCE = 60.0
 DONE = (TrialState.COMPLETE, TrialState.PRUNED)
 ALIVE = (TrialState.WAITING, TrialState.RUNNING)
 
@@ -31,32 +33,49 @@ def enter_study(
     :raises ConfigError: if there is another study of that name
     """
     wanted = json.loads(json.dumps(definition.as_dict()))
-    try:
-        study = optuna.create_study(storage=storage, study_name=name, direction="maximize")
-    except optuna.exceptions.DuplicatedStudyError:
-        study = optuna.load_study(storage=storage, study_name=name)
-        _wait_until_filled(study)
-        _compare(study, wanted)
-    study.set_user_attr("method", definition.method)
-    study.set_user_attr(DEFINITION, {**wanted, **study.user_attrs.get(DEFINITION, {})})
-    _fill(study, definition_of(study), max(trials, study.user_attrs.get(FILLED, 0)))
+    with _alone(storage, name):
+        study = optuna.create_study(
+            storage=storage, study_name=name, direction="maximize", load_if_exists=True
+        )
+        known = study.user_attrs
+        if DEFINITION in known or study.get_trials(deepcopy=False):
+            _compare(study, wanted)
+        else:
+            study.set_user_attr("method", definition.method)
+            study.set_user_attr(DEFINITION, wanted)
+        _fill(study, definition_of(study), max(trials, known.get(FILLED, 0)))
     return study
 
 
-def _wait_until_filled(study: optuna.Study) -> None:
-    """Another process may be at it; if nothing happens, it died and we go on where it was."""
-    seen, since = -1, time.monotonic()
-    while FILLED not in study.user_attrs and time.monotonic() - since < PATIENCE:
-        count = len(study.get_trials(deepcopy=False))
-        if count != seen:
-            seen, since = count, time.monotonic()
-        time.sleep(0.2)
+@contextmanager
+def _alone(storage: BaseStorage, name: str) -> Iterator[None]:
+    """Within it, no other process makes or fills the study, on whatever machine.
+
+    What all storages do for one process alone is to make a study of a new name.
+    """
+    lock, since = f"{name} is being filled", time.monotonic()
+    while True:
+        try:
+            optuna.create_study(storage=storage, study_name=lock)
+            break
+        except optuna.exceptions.DuplicatedStudyError:
+            if time.monotonic() - since > PATIENCE:  # whoever made it has died
+                _unlock(storage, lock)
+                since = time.monotonic()
+            time.sleep(0.2)
+    try:
+        yield
+    finally:
+        _unlock(storage, lock)
+
+
+def _unlock(storage: BaseStorage, lock: str) -> None:
+    with suppress(KeyError):  # another process was quicker
+        optuna.delete_study(storage=storage, study_name=lock)
 
 
 def _compare(study: optuna.Study, wanted: dict[str, Any]) -> None:
     known = study.user_attrs.get(DEFINITION)
-    if known is None and not study.get_trials(deepcopy=False):
-        return  # made by a process that died at once
     differ = ["it was not made by sb3-sparse"] if known is None else differences(wanted, known)
     if differ:
         raise ConfigError(
@@ -138,7 +157,7 @@ class Standing:
     @property
     def finished(self) -> bool:
         """Whether every planned trial is done."""
-        return len(self.done) >= self.planned
+        return len({ticket_of(trial) for trial in self.done}) >= self.planned
 
 
 def standing_of(study: optuna.Study) -> Standing:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping
-from contextlib import closing
-from dataclasses import dataclass
+from contextlib import closing, suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from platform import node
 from typing import Any
@@ -18,6 +19,7 @@ from sb3_sparse.tuning.spacefile import space_of
 from sb3_sparse.tuning.spaces import Space
 from sb3_sparse.tuning.storage import FOLDER, HEARTBEAT, JOURNAL, open_storage
 from sb3_sparse.tuning.study import Standing, enter_study, standing_of
+from sb3_sparse.tuning.urls import is_journal, shown_url
 from sb3_sparse.zoo.prepare import prepare
 from sb3_sparse.zoo.run import Run
 
@@ -95,7 +97,7 @@ def tune(
     check_workers(workers)
     chosen = launcher_named(launcher) if isinstance(launcher, str) else launcher
     definition = define(run, space, seeds, sampler, pruner, log_folder)
-    name = name or definition.default_name
+    name = definition.default_name if name is None else _checked(name)
     number = definition.trials(trials)
     storage = storage or log_folder.absolute() / FOLDER / JOURNAL
     folder = log_folder.absolute() / FOLDER / name.replace("/", "-")
@@ -110,10 +112,26 @@ def tune(
                 if ended is not None and ended.error is not None:
                     errors[ended.task.name] = ended.error
                 if watch is not None:
-                    watch(standing_of(study))
-    standing = standing_of(study)
+                    with suppress(optuna.exceptions.StorageInternalError):  # the workers go on
+                        watch(standing_of(study))
+    try:
+        standing = standing_of(study)
+    except optuna.exceptions.StorageInternalError:
+        raise ConfigError(
+            f"the storage {shown_url(storage)} cannot be reached any more; what was done is kept "
+            "there, and the same command goes on when it is back"
+        ) from None  # whose text may hold the password
     config = write_best(study, folder / BEST) if standing.best is not None else None
     return Tuned(study, standing, folder, config, not before.finished, errors)
+
+
+def _checked(name: str) -> str:
+    if name.strip() in ("", ".", "..") or name.startswith("-"):
+        raise ConfigError(
+            f"a study cannot be named {name!r}, which is no name of a folder or looks like an "
+            "option; give it a name of letters and digits"
+        )
+    return name
 
 
 def define(
@@ -136,13 +154,14 @@ def define(
         sampler = "grid" if searched.grid is not None else "tpe"
     if pruner is None:
         pruner = "none" if sampler == "grid" else "median"
+    run = replace(run, entry=run.config_entry())  # workers and reports need no file
     return Definition(run, searched, seeds, sampler, pruner, fixed_compute(run))
 
 
 def _tasks(
     storage: str | Path, name: str, folder: Path, workers: int, heartbeat: int
 ) -> list[Task]:
-    if isinstance(storage, Path) or "://" not in storage:
+    if is_journal(storage):
         storage = str(Path(storage).absolute())
     arguments: dict[str, Any] = {
         "storage": storage,
@@ -151,6 +170,6 @@ def _tasks(
         "heartbeat": heartbeat,
     }
     return [
-        Task(f"worker {n}", WORK, arguments, folder / f"{node()}_{n}.log")
+        Task(f"worker {n}", WORK, arguments, folder / f"{node()}_{os.getpid()}_{n}.log")
         for n in range(1, workers + 1)
     ]

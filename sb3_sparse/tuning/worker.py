@@ -8,10 +8,11 @@ import traceback
 from pathlib import Path
 from platform import node
 
-from sb3_sparse.tuning.backend import FrozenTrial, Trial, optuna
+from sb3_sparse.tuning.backend import FrozenTrial, Trial, TrialState, optuna
 from sb3_sparse.tuning.objective import Objective
-from sb3_sparse.tuning.storage import HEARTBEAT, QueueEmpty, open_storage, retry_with, shown_url
+from sb3_sparse.tuning.storage import HEARTBEAT, QueueEmpty, open_storage, retry_with
 from sb3_sparse.tuning.study import ERROR, definition_of, find_study, standing_of
+from sb3_sparse.tuning.urls import shown_url
 
 FAILURES = 3
 MOMENT = 1.0
@@ -58,7 +59,9 @@ def work(
             time.sleep(MOMENT)  # until the others are done, or are found to be lost
         except KeyboardInterrupt:
             if attempt.number is not None:
-                again(study, study.get_trials(deepcopy=False)[attempt.number])
+                trial = study.get_trials(deepcopy=False)[attempt.number]
+                if trial.state == TrialState.FAIL:
+                    again(study, trial)
             raise
         except Exception as error:
             if attempt.number is None:

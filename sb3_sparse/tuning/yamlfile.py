@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -12,6 +13,7 @@ from sb3_sparse.errors import ConfigError, MissingExtra
 try:
     from ruamel.yaml import YAML
     from ruamel.yaml.comments import CommentedMap
+    from ruamel.yaml.error import YAMLError
 except ImportError as error:
     raise MissingExtra("writing tuned configs", "tune") from error
 
@@ -50,14 +52,22 @@ def merge_entry(
     :param name: of the file, for messages
     :raises ConfigError: if other entries would change with this one, or the text is not understood
     """
+    ending = "\r\n" if "\r\n" in text else "\n"
     lines = text.splitlines()
-    document = YAML().load(text)
-    if key in document:
-        _Entry(lines, document, key).change(settings, comment, mark)
-    else:
-        lines += ["", *_new_entry(document, key, settings, comment)]
-    changed = "\n".join(lines) + "\n"
-    before, after = yaml.safe_load(text), yaml.safe_load(changed)
+    by_hand = f"the entry {key} in {name} cannot be changed line by line"
+    cure = "take the tuned settings from best.yml by hand"
+    try:
+        document = YAML().load(text)
+        if key in document:
+            if not isinstance(document[key], CommentedMap) or document[key].fa.flow_style():
+                raise ConfigError(f"{by_hand}, since it is no indented block; {cure}")
+            _Entry(lines, document, key).change(settings, comment, mark)
+        else:
+            lines += ["", *_new_entry(document, key, settings, comment)]
+        changed = ending.join(lines) + ending
+        before, after = yaml.safe_load(text), yaml.safe_load(changed)
+    except (yaml.YAMLError, YAMLError) as error:
+        raise ConfigError(f"{by_hand} ({str(error).splitlines()[0]}); {cure}") from error
     others = [k for k in before if k != key and before[k] != after.get(k)]
     if others:
         raise ConfigError(
@@ -65,11 +75,9 @@ def merge_entry(
             f"it; give {key} an entry of its own first"
         )
     if after[key] != dict(settings):
-        differ = [k for k in {*after[key], *settings} if after[key].get(k) != settings.get(k)]
-        raise ConfigError(
-            f"the entry {key} in {name} cannot be changed to the tuned settings (it would differ "
-            f"in {', '.join(sorted(differ))}); take them from best.yml by hand"
-        )
+        differ = {k for k in {*after[key], *settings} if after[key].get(k) != settings.get(k)}
+        kept = ", ".join(sorted(differ))
+        raise ConfigError(f"{by_hand} to the tuned settings (it would differ in {kept}); {cure}")
     return changed
 
 
@@ -127,7 +135,8 @@ class _Entry:
             else:
                 new = self._dumped(name, value, column)
                 if last == first + 1 and isinstance(old, (bool, int, float)):
-                    new[0] += "".join(self.lines[first].partition("  #")[1:])
+                    comment = re.search(r"\s+#.*$", self.lines[first])
+                    new[0] += comment.group() if comment else ""
                 edits.append((first, last, new))
         if added:
             edits.append((end, end, added))

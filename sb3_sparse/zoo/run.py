@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from copy import deepcopy
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -44,6 +45,7 @@ class Run:
     :param match_params: train the dense network that has as many parameters as this sparsity leaves
     :param eval_freq: environment steps between two evaluations
     :param eval_episodes: episodes of one evaluation
+    :param entry: settings in place of those that the config has for the environment
     :raises ConfigError: for a name or value that is not allowed
     """
 
@@ -61,6 +63,7 @@ class Run:
     match_params: float | None = None
     eval_freq: int | None = None
     eval_episodes: int | None = None
+    entry: Mapping[str, Any] | None = None
 
     def __post_init__(self) -> None:
         if self.algo not in algorithms():
@@ -94,12 +97,21 @@ class Run:
             return Path(self.conf_file)
         return config_path(self.method or "rigl", self.conf_file or self.algo)
 
+    def config_entry(self) -> dict[str, Any]:
+        """What the config has for the environment; a copy of one's own.
+
+        :raises ConfigError: if it has nothing
+        """
+        if self.entry is not None:
+            return deepcopy(dict(self.entry))
+        return entry_of(self.config, self.env_id, is_atari(self.env_id))
+
     def settings(self) -> dict[str, Any]:
         """The config's entry, with everything that this run wants otherwise.
 
         :raises ConfigError: if the config has none, or if it and the run contradict each other
         """
-        settings = entry_of(self.config, self.env_id, is_atari(self.env_id))
+        settings = self.config_entry()
         settings["policy_kwargs"] = policy_kwargs_of(settings)
         method = method_of(settings)
         if self.method not in (None, method):

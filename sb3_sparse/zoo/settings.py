@@ -123,13 +123,14 @@ def sparsity_callback(settings: Mapping[str, Any], wanted: str = "") -> dict[str
     :param wanted: what is to be set, for the message
     :raises ConfigError: if there is no such callback
     """
-    arguments = _find_callback(settings)
+    arguments = find_callback(settings)
     if arguments is None:
         raise ConfigError(f"{wanted} means nothing here: these settings train without {CALLBACK}")
     return arguments
 
 
-def _find_callback(settings: Mapping[str, Any]) -> dict[str, Any] | None:
+def find_callback(settings: Mapping[str, Any]) -> dict[str, Any] | None:
+    """The arguments of the SparsityCallback in the settings; None where there is none."""
     callbacks = settings.get("callback") or []
     for callback in callbacks if isinstance(callbacks, list) else [callbacks]:
         named = callback if isinstance(callback, dict) else {callback: {}}
@@ -158,7 +159,7 @@ def check_values(settings: Mapping[str, Any]) -> None:
 
     :raises ConfigError: if there is any
     """
-    callback = _find_callback(settings) or {}
+    callback = find_callback(settings) or {}
     for part in (settings, policy_kwargs_of(settings), callback):
         for name, value in part.items():
             if isinstance(value, str) and _is_number(value):
@@ -195,7 +196,7 @@ def method_of(settings: Mapping[str, Any]) -> str:
         raise ConfigError(
             f"the policy must be {POLICY} (with sparsity 0.0 for dense training), got {policy!r}"
         )
-    callback = _find_callback(settings)
+    callback = find_callback(settings)
     if callback is not None:
         return method_named(callback["method"]).name
     sparsity = policy_kwargs_of(settings).get("sparsity")

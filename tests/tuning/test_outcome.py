@@ -46,7 +46,9 @@ def finished(storage, name, value, run=None, space=SPACE, seeds=1):
         trial.report(value(sampled), 1)
         return value(sampled)
 
-    study.optimize(objective, n_trials=definition.trials(None))
+    waiting = study.get_trials(states=(TrialState.WAITING,))
+    if waiting:
+        study.optimize(objective, n_trials=len(waiting))
     return study
 
 
@@ -98,6 +100,53 @@ def test_the_best_values_go_into_one_entry_of_a_config(storage, tmp_path):
     lines = iter(path.read_text().splitlines())
     assert all(line in lines for line in text.splitlines())  # all are there, in their order
     assert "Acrobot-v1:\n  # Tuned by sb3-sparse: study acrobot, " in path.read_text()
+
+
+def config_of_ones_own(tmp_path) -> Path:
+    path = tmp_path / "mine.yml"
+    path.write_text(config_path("rigl", "dqn").read_text())
+    return path
+
+
+def test_a_study_whose_config_has_taken_the_best_values_is_still_the_same(storage, tmp_path):
+    path = config_of_ones_own(tmp_path)
+    run = small_run(env_id="Acrobot-v1", conf_file=str(path))
+    study = finished(storage, "mine", decay_matters, run)
+    best = best_settings(study)
+    write_into(study, path)
+    again = finished(storage, "mine", decay_matters, run)
+    assert len(again.get_trials()) == 6
+    assert best_settings(again) == best
+    path.write_text(path.read_text().replace("gamma: 0.99", "gamma: 0.9"))
+    with pytest.raises(ConfigError, match="settings.gamma is 0.99 there and 0.9 now"):
+        finished(storage, "mine", decay_matters, run)
+
+
+def test_a_study_needs_its_config_no_more(storage, study, tmp_path):
+    path = config_of_ones_own(tmp_path)
+    other = finished(storage, "other", decay_matters, small_run(conf_file=str(path)))
+    path.unlink()
+    assert "<h2>mine</h2>" in report_on(["mine"], None, tmp_path, None).read_text()
+    assert best_settings(other)["gamma"] == 0.99
+
+
+def test_a_link_stays_a_link_and_modes_stay(storage, tmp_path):
+    path = config_of_ones_own(tmp_path)
+    path.chmod(0o664)
+    link = tmp_path / "link.yml"
+    link.symlink_to(path)
+    write_into(finished(storage, "a", decay_matters, small_run(env_id="Acrobot-v1")), link)
+    assert link.is_symlink()
+    assert "Tuned by" in path.read_text()
+    assert path.stat().st_mode & 0o777 == 0o664
+
+
+def test_where_sparsity_is_searched_the_report_names_the_best(storage, tmp_path):
+    space = choices(sparsity=[0.5, 0.75, 0.9])
+    study = finished(storage, "s", lambda v: -abs(v["sparsity"] - 0.75), space=space)
+    page = write_report([study], storage, tmp_path / "page.html").read_text()
+    assert "rigl at 75%" in page
+    assert "rigl at 90%" not in page
 
 
 def test_a_config_of_another_method_is_left_alone(study, tmp_path):
@@ -155,7 +204,7 @@ def test_studies_that_cannot_be_reported(study, storage, tmp_path, names, messag
 
 
 def test_a_journal_that_is_not_there(tmp_path):
-    with pytest.raises(ConfigError, match="there is no journal .*give the --log-folder or"):
+    with pytest.raises(ConfigError, match="there are no studies in .*journal.log; give the"):
         report_on(["x"], None, tmp_path, None)
 
 

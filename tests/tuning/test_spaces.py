@@ -126,7 +126,12 @@ def test_a_function_may_search_what_depends_on_other_values(tmp_path):
     ("run", "space", "message"),
     [
         ({}, dict(weight_decai=[0.0]), "has no hyperparameter 'weight_decai'; did you mean"),
-        ({}, dict(n_timesteps=[10, 20]), None),
+        ({}, dict(n_timesteps=[10, 20]), "trials are compared at equal numbers of steps"),
+        (dict(n_envs=2), dict(n_envs=[1, 2]), "varies n_envs, which is also fixed to 2"),
+        ({}, dict(distribution=["erk", "banana"]), "banana"),
+        ({}, dict(weight_decay=[0.0, "1e-4"]), "weight_decay is the text '1e-4'"),
+        ({}, dict(drop_fraction=[0.1, 1.5]), "drop_fraction"),
+        ({}, dict(sparsity=[0.5, 1.0]), r"sparsity.*1.0"),
         (dict(method="static"), dict(update_interval=[1]), "'static' has no update_interval"),
         (dict(method="prune"), dict(drop_fraction=[0.1]), "'prune' has no drop_fraction"),
         (dict(method="dense"), dict(drop_fraction=[0.1]), "'dense' has no drop_fraction"),
@@ -137,9 +142,6 @@ def test_a_function_may_search_what_depends_on_other_values(tmp_path):
 )
 def test_a_space_that_the_run_has_no_place_for_is_refused(run, space, message):
     run = Run(**{"n_timesteps": 3000, **run})
-    if message is None:
-        check_space(choices(**space), run)
-        return
     with pytest.raises(ConfigError, match=message):
         check_space(choices(**space), run)
 
@@ -150,8 +152,10 @@ def test_a_space_that_the_run_has_no_place_for_is_refused(run, space, message):
         ("a.yml", "{}", "the search space 'a' is empty"),
         ("a.yml", "", "must map hyperparameters to choices, got None"),
         ("a.yml", "weight_decay: []", "weight_decay in a.yml: .*one or more"),
-        ("a.yml", "weight_decay: 3", "weight_decay in a.yml must be a list of choices, or a map"),
-        ("a.yml", "gamma: {low: 1.0}", "gamma in a.yml: .*high"),
+        ("a.yml", "weight_decay: 3", "weight_decay in a.yml must be a list of choices, or a range"),
+        ("a.yml", "gamma: {low: 1.0}", "gamma in a.yml must be .* a range {low: 0.1, high: 0.5}"),
+        ("a.yml", "gamma: {low: 1e-6, high: 1}", "YAML reads 1e-6 as text; write 1.0e-6"),
+        ("a.yml", "gamma: {low: 0, high: 1, foo: 1}", "log: true or step: 0.1 may be added"),
         ("a.yml", "gamma: {low: 1.0, high: 0.5}", "gamma in a.yml: .*low.*high"),
         ("a.py", "x = 1", "a.py must define `space`"),
         ("a.py", "space = {}", "the search space 'a' is empty"),

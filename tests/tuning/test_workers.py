@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import sqlite3
 import subprocess
@@ -17,10 +18,11 @@ from tuning_support import choices, small_run
 
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.launch import Launcher
-from sb3_sparse.tuning import tune
+from sb3_sparse.tuning import Space, tune
 from sb3_sparse.tuning.backend import TrialState, optuna
-from sb3_sparse.tuning.storage import open_storage
-from sb3_sparse.tuning.study import enter_study, standing_of
+from sb3_sparse.tuning.samplers import TICKET, sampler_of
+from sb3_sparse.tuning.storage import QueueEmpty, open_storage, retry_with
+from sb3_sparse.tuning.study import enter_study, standing_of, ticket_of
 from sb3_sparse.tuning.tune import define
 from sb3_sparse.tuning.worker import TooManyFailures, work
 
@@ -264,7 +266,7 @@ def unreachable():
     [
         (unreachable(), r"postgresql\+psycopg://tuner:\*\*\*@127.0.0.1:9/studies cannot be"),
         (f"{unreachable()}?password=s3cret", "password=hidden cannot be reached"),
-        ("redis://:s3cret@localhost", "a storage redis://... is not known; allowed are"),
+        ("redis://:s3cret@localhost", "a storage redis://... is not known, .*; allowed are"),
         ("postgres:/s3cret://x", "a storage of this form is not known"),
     ],
 )
@@ -273,6 +275,105 @@ def test_a_storage_that_cannot_be_reached_is_named_without_its_password(tmp_path
         tune(small_run(), choices(**GRID), storage=storage, log_folder=tmp_path)
     assert "s3cret" not in str(caught.value)
     assert caught.value.__suppress_context__ or caught.value.__context__ is None
+
+
+@pytest.mark.parametrize(
+    ("url", "message"),
+    [
+        (
+            "postgresql://u:s3cr@t3@127.0.0.1:9/x",
+            "more than one @; write an @ in a password as",
+        ),
+        ("postgresql://u:p:s3cret@127.0.0.1:t3/x", "is not known, or the rest of its URL is not"),
+    ],
+)
+def test_an_odd_password_is_not_shown_either(url, message):
+    with pytest.raises(ConfigError, match=message) as caught:
+        open_storage(url)
+    assert not re.search("s3|t3", str(caught.value))
+
+
+@pytest.mark.parametrize("kind", ["journal", "sqlite", "postgres"])
+def test_commands_that_start_or_extend_a_study_at_once_plan_each_trial_once(
+    kind, tmp_path, request
+):
+    storages = {"journal": tmp_path / "j.log", "sqlite": f"sqlite:///{tmp_path}/s.db"}
+    storage = storages.get(kind) or request.getfixturevalue("postgres")
+    space = choices(weight_decay=[n * 1e-6 for n in range(30)])
+    definition = define(small_run(), space, 1, None, None, tmp_path)
+    failures = []
+
+    def enter(trials):
+        try:
+            enter_study(open_storage(storage), "at once", definition, trials)
+        except Exception as error:
+            failures.append(error)
+
+    for trials in (10, 30):
+        threads = [threading.Thread(target=enter, args=(trials,)) for _ in range(4)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert not failures
+        study = optuna.load_study(storage=open_storage(storage), study_name="at once")
+        assert sorted(map(ticket_of, study.get_trials())) == list(range(trials))
+    names = {summary.study_name for summary in open_storage(storage).get_all_studies()}
+    assert not {name for name in names if "being filled" in name}
+
+
+def test_what_was_interrupted_comes_first_and_changes_nothing(tmp_path):
+    space = Space("s", {"x": optuna.distributions.FloatDistribution(0, 1)})
+
+    def sampled(name, interrupted):
+        storage = open_storage(tmp_path / name)
+        study = optuna.create_study(storage=storage, direction="maximize")
+        study.sampler = sampler_of("tpe", space, 0)
+        for number in range(20):
+            waiting = optuna.create_trial(state=TrialState.WAITING, system_attrs={TICKET: number})
+            study.add_trial(waiting)
+        asked = 0
+
+        def objective(trial):
+            nonlocal asked
+            asked += 1
+            x = trial.suggest_float("x", 0, 1)
+            if asked == interrupted:
+                raise KeyboardInterrupt
+            return -((x - 0.3) ** 2)
+
+        while True:
+            try:
+                study.optimize(objective, n_trials=1)
+            except KeyboardInterrupt:
+                retry_with(None)(study, study.get_trials()[interrupted - 1])
+            except QueueEmpty:
+                break
+        done = [trial for trial in study.get_trials() if trial.state == TrialState.COMPLETE]
+        return {ticket_of(trial): trial.params for trial in done}
+
+    assert sampled("whole", None) == sampled("interrupted", 13)
+
+
+def test_a_storage_that_goes_away_is_one_line(tmp_path, monkeypatch):
+    made(tmp_path)
+
+    def gone(study):
+        raise optuna.exceptions.StorageInternalError("me:s3cret@host")
+
+    looks = iter([standing_of])
+    module = sys.modules[tune.__module__]
+    monkeypatch.setattr(module, "standing_of", lambda study: next(looks, gone)(study))
+    with pytest.raises(ConfigError, match="journal.log cannot be reached any more") as caught:
+        made(tmp_path, watch=lambda standing: None)
+    assert "s3cret" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["", ".", "..", "-x"])
+def test_names_that_are_no_folders_are_refused(tmp_path, name):
+    with pytest.raises(ConfigError, match="a study cannot be named"):
+        tune(small_run(), choices(**GRID), log_folder=tmp_path, name=name, launcher=NoWorkers())
+    assert not list(tmp_path.iterdir())
 
 
 def test_sqlite_works_too(tmp_path):

@@ -121,6 +121,27 @@ def test_an_entry_that_others_take_their_values_from_is_left_alone():
         merged(FILE, "default", {**entry(FILE, "default"), "gamma": 0.5})
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        "Ant-v5: {gamma: 0.5}\n",
+        "Ant-v5: {gamma: 0.5,\n  tau: 1.0}\n",
+        "Hopper-v5: &h\n  gamma: 0.5\nAnt-v5: *h\nOther: {a: 1}\n",
+        "Ant-v5:\n  gamma: 0.5\n  gamma: 0.6\n",
+        "Hopper-v5:\n  gamma: 0.5\n...\n",
+    ],
+)
+def test_what_cannot_be_changed_line_by_line_is_refused(text):
+    with pytest.raises(ConfigError, match="best.yml by hand|take their values from"):
+        merged(text, "Ant-v5", {"gamma": 0.9, "tau": 0.1})
+
+
+def test_line_endings_and_close_comments_stay():
+    text = "Ant-v5:\r\n  gamma: 0.5 # why\r\nOther:\r\n  a: 1\r\n"
+    new = merged(text, "Ant-v5", {"gamma": 0.9})
+    assert new == text.replace("0.5", "0.9").replace("Ant-v5:", f"Ant-v5:\r\n  # {COMMENT}")
+
+
 def test_a_key_that_has_to_go_is_refused():
     wanted = entry(FILE, "Walker2d-v5")
     del wanted["learning_rate"]

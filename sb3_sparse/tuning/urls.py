@@ -1,0 +1,68 @@
+"""URLs of storages: understood, and printed without their passwords."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from sb3_sparse.errors import ConfigError
+
+DATABASES = ("sqlite", "postgresql", "mysql", "mariadb", "mssql")
+
+
+def is_journal(storage: str | Path) -> bool:
+    """Whether a storage is a path, so a journal file."""
+    return isinstance(storage, Path) or "://" not in storage
+
+
+def file_of(storage: str | Path) -> Path | None:
+    """The file of a journal or an SQLite database; None for a server."""
+    if is_journal(storage):
+        return Path(storage)
+    url = url_of(str(storage))
+    return Path(url.database or "") if url.get_backend_name() == "sqlite" else None
+
+
+def shown_url(storage: str | Path) -> str:
+    """A storage as it may be printed.
+
+    :raises ConfigError: if it is none
+    """
+    if is_journal(storage):
+        return str(storage)
+    url = url_of(str(storage))
+    hidden = {
+        name: "hidden" if "pass" in name.lower() else value for name, value in url.query.items()
+    }
+    return str(url.set(query=hidden).render_as_string(hide_password=True))
+
+
+def url_of(storage: str) -> Any:
+    """A URL as SQLAlchemy has it, for the driver that the extra ``postgres`` brings.
+
+    :raises ConfigError: for another kind of storage, or a URL that is none; shows its scheme alone
+    """
+    from sqlalchemy.engine import make_url
+    from sqlalchemy.exc import ArgumentError
+
+    scheme, _, rest = storage.partition("://")
+    shown = f"{scheme}://..." if scheme.replace("+", "").isalnum() else "of this form"
+    if rest.partition("?")[0].count("@") > 1:
+        raise ConfigError(
+            f"the storage {shown} has more than one @; write an @ in a password as %40, a : as %3A "
+            "and a / as %2F"
+        )
+    try:
+        url = make_url(storage)
+        known = url.get_backend_name() in DATABASES
+    except (ArgumentError, ValueError):  # whose texts may hold the password
+        known = False
+    if not known:
+        raise ConfigError(
+            f"a storage {shown} is not known, or the rest of its URL is not understood; allowed "
+            "are a path (a journal file) and URLs of SQLAlchemy: sqlite:///file.db, "
+            "postgresql://user:password@host:5432/database, mysql://..."
+        ) from None
+    if url.drivername == "postgresql":
+        url = url.set(drivername="postgresql+psycopg")
+    return url
