@@ -68,7 +68,8 @@ def write_best(study: optuna.Study, path: Path) -> Path:
 def check_target(run: Run, path: Path) -> None:
     """Refuse a config that the tuned settings of a run have no place in.
 
-    :raises ConfigError: if there is no such file, or it is for another method
+    :raises ConfigError: if there is no such file, it is for another method, or its entry is not
+        written in a way that can be changed
     """
     there = method_of(entry_of(path, run.env_id, is_atari(run.env_id)))
     tuned = method_of(run.settings())
@@ -77,6 +78,7 @@ def check_target(run: Run, path: Path) -> None:
             f"{path} trains {run.env_id} by method {there!r}, but {tuned!r} is tuned; name the "
             "file of that method"
         )
+    merge_entry(_read(path), run.env_id, run.settings(), TUNED, TUNED, str(path))
 
 
 def write_into(study: optuna.Study, path: Path) -> None:

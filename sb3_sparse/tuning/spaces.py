@@ -134,6 +134,15 @@ def sample_of(space: Space) -> dict[str, Any]:
     return space.sample(study.ask())
 
 
+def many_samples_of(space: Space) -> dict[str, Any]:
+    """A value of each name that the space may give, those of a function's branches too."""
+    study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
+    values: dict[str, Any] = {}
+    for _ in range(32):
+        values.update(space.sample(study.ask()))
+    return values
+
+
 def check_space(space: Space, run: Run) -> None:
     """Refuse a space that the run has no place for, before anything is trained.
 
@@ -143,7 +152,7 @@ def check_space(space: Space, run: Run) -> None:
         that the run itself has fixed, or a value that is not allowed
     """
     values = sample_of(space)
-    fixed = {**run.hyperparams, **{name: getattr(run, name) for name in OPTIONS}}
+    fixed = {**{name: getattr(run, name) for name in OPTIONS}, **run.hyperparams}
     for name in values:
         if name == "n_timesteps":
             raise ConfigError(

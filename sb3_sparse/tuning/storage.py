@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import tempfile
 import time
 import warnings
 from collections.abc import Callable, Container, Iterator, Sequence
@@ -99,10 +100,8 @@ class QueueJournal(_FromQueue, JournalStorage, BaseHeartbeat):
         return changed
 
     def _get_stale_trial_ids(self, study_id: int) -> list[int]:
-        clock = self._alive / f"clock-{os.getpid()}"
-        clock.touch()  # the clock of the file system, whichever machine asks
-        now = clock.stat().st_mtime
-        clock.unlink(missing_ok=True)
+        with tempfile.TemporaryFile(dir=self._alive) as new:
+            now = os.fstat(new.fileno()).st_mtime  # by the clock of the files, whoever asks
         running = self.get_all_trials(study_id, deepcopy=False, states=(TrialState.RUNNING,))
         return [
             trial._trial_id

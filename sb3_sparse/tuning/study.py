@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any
@@ -16,6 +16,7 @@ from sb3_sparse.tuning.samplers import TICKET
 
 DEFINITION = "sb3_sparse:definition"
 FILLED = "sb3_sparse:trials"
+SIGN = "alive"
 ERROR = "error"
 PATIENCE = 60.0
 DONE = (TrialState.COMPLETE, TrialState.PRUNED)
@@ -33,7 +34,7 @@ def enter_study(
     :raises ConfigError: if there is another study of that name
     """
     wanted = json.loads(json.dumps(definition.as_dict()))
-    with _alone(storage, name):
+    with _alone(storage, name) as alive:
         study = optuna.create_study(
             storage=storage, study_name=name, direction="maximize", load_if_exists=True
         )
@@ -43,35 +44,46 @@ def enter_study(
         else:
             study.set_user_attr("method", definition.method)
             study.set_user_attr(DEFINITION, wanted)
-        _fill(study, definition_of(study), max(trials, known.get(FILLED, 0)))
+        _fill(study, definition_of(study), max(trials, known.get(FILLED, 0)), alive)
     return study
 
 
 @contextmanager
-def _alone(storage: BaseStorage, name: str) -> Iterator[None]:
+def _alone(storage: BaseStorage, name: str) -> Iterator[Callable[[], None]]:
     """Within it, no other process makes or fills the study, on whatever machine.
 
-    What all storages do for one process alone is to make a study of a new name.
+    What all storages do for one process alone is to make a study of a new name. Yields what gives
+    a sign of life; whoever gives none for long is taken for dead.
     """
-    lock, since = f"{name} is being filled", time.monotonic()
+    lock, seen, since = f"{name} is being filled", None, time.monotonic()
     while True:
         try:
-            optuna.create_study(storage=storage, study_name=lock)
+            held = optuna.create_study(storage=storage, study_name=lock)
             break
         except optuna.exceptions.DuplicatedStudyError:
-            if time.monotonic() - since > PATIENCE:  # whoever made it has died
-                _unlock(storage, lock)
-                since = time.monotonic()
+            sign = _sign_of(storage, lock)
+            if sign != seen:
+                seen, since = sign, time.monotonic()
+            elif sign is not None and time.monotonic() - since > PATIENCE:
+                _delete(storage, sign[0])
             time.sleep(0.2)
     try:
-        yield
+        yield lambda: held.set_user_attr(SIGN, time.time())
     finally:
-        _unlock(storage, lock)
+        _delete(storage, storage.get_study_id_from_name(lock))
 
 
-def _unlock(storage: BaseStorage, lock: str) -> None:
+def _sign_of(storage: BaseStorage, lock: str) -> tuple[int, Any] | None:
+    try:
+        study_id = storage.get_study_id_from_name(lock)
+        return study_id, storage.get_study_user_attrs(study_id).get(SIGN)
+    except KeyError:  # it has just been given back
+        return None
+
+
+def _delete(storage: BaseStorage, study_id: int) -> None:
     with suppress(KeyError):  # another process was quicker
-        optuna.delete_study(storage=storage, study_name=lock)
+        storage.delete_study(study_id)
 
 
 def _compare(study: optuna.Study, wanted: dict[str, Any]) -> None:
@@ -84,10 +96,14 @@ def _compare(study: optuna.Study, wanted: dict[str, Any]) -> None:
         )
 
 
-def _fill(study: optuna.Study, definition: Definition, trials: int) -> None:
+def _fill(
+    study: optuna.Study, definition: Definition, trials: int, alive: Callable[[], None]
+) -> None:
     known = study.get_trials(deepcopy=False)
     present = {ticket_of(trial) for trial in known if trial.state in (*DONE, *ALIVE)}
     for number in range(trials):
+        if number % 20 == 0:
+            alive()
         if number not in present:
             attributes = {TICKET: number, **definition.ticket(number)}
             study.add_trial(optuna.create_trial(state=TrialState.WAITING, system_attrs=attributes))

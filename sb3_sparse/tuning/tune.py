@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
-from contextlib import closing, suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from platform import node
@@ -102,10 +102,11 @@ def tune(
     storage = storage or log_folder.absolute() / FOLDER / JOURNAL
     folder = log_folder.absolute() / FOLDER / name.replace("/", "-")
     opened = open_storage(storage, heartbeat)
-    study = enter_study(opened, name, definition, number)
-    before = standing_of(study)
     errors: dict[str, str] = {}
-    if not before.finished:
+    with _in_reach(storage):
+        study = enter_study(opened, name, definition, number)
+        began = not standing_of(study).finished
+    if began:
         tasks = _tasks(storage, name, folder, workers, heartbeat)
         with closing(chosen.run(tasks, workers)) as endings:
             for ended in endings:
@@ -114,15 +115,22 @@ def tune(
                 if watch is not None:
                     with suppress(optuna.exceptions.StorageInternalError):  # the workers go on
                         watch(standing_of(study))
-    try:
+    with _in_reach(storage):
         standing = standing_of(study)
+        config = write_best(study, folder / BEST) if standing.best is not None else None
+    return Tuned(study, standing, folder, config, began, errors)
+
+
+@contextmanager
+def _in_reach(storage: str | Path) -> Iterator[None]:
+    """Say in one line that a storage went away."""
+    try:
+        yield
     except optuna.exceptions.StorageInternalError:
         raise ConfigError(
             f"the storage {shown_url(storage)} cannot be reached any more; what was done is kept "
             "there, and the same command goes on when it is back"
         ) from None  # whose text may hold the password
-    config = write_best(study, folder / BEST) if standing.best is not None else None
-    return Tuned(study, standing, folder, config, not before.finished, errors)
 
 
 def _checked(name: str) -> str:

@@ -47,7 +47,7 @@ def url_of(storage: str) -> Any:
 
     scheme, _, rest = storage.partition("://")
     shown = f"{scheme}://..." if scheme.replace("+", "").isalnum() else "of this form"
-    if rest.partition("?")[0].count("@") > 1:
+    if rest.count("@") > 1:
         raise ConfigError(
             f"the storage {shown} has more than one @; write an @ in a password as %40, a : as %3A "
             "and a / as %2F"
@@ -55,6 +55,7 @@ def url_of(storage: str) -> Any:
     try:
         url = make_url(storage)
         known = url.get_backend_name() in DATABASES
+        known = known and "@" not in (url.host or "")
     except (ArgumentError, ValueError):  # whose texts may hold the password
         known = False
     if not known:
@@ -63,6 +64,11 @@ def url_of(storage: str) -> Any:
             "are a path (a journal file) and URLs of SQLAlchemy: sqlite:///file.db, "
             "postgresql://user:password@host:5432/database, mysql://..."
         ) from None
+    if url.get_backend_name() == "sqlite" and not url.database:
+        raise ConfigError(
+            "a storage sqlite:// lives in one process alone, and workers are processes; name a "
+            "file, e.g. sqlite:///studies.db"
+        )
     if url.drivername == "postgresql":
         url = url.set(drivername="postgresql+psycopg")
     return url

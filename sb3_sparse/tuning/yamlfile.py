@@ -59,8 +59,10 @@ def merge_entry(
     try:
         document = YAML().load(text)
         if key in document:
-            if not isinstance(document[key], CommentedMap) or document[key].fa.flow_style():
-                raise ConfigError(f"{by_hand}, since it is no indented block; {cure}")
+            entry = document[key]
+            shared = any(document[other] is entry for other in document if other != key)
+            if shared or not isinstance(entry, CommentedMap) or entry.fa.flow_style():
+                raise ConfigError(f"{by_hand}, since it is no block of its own; {cure}")
             _Entry(lines, document, key).change(settings, comment, mark)
         else:
             lines += ["", *_new_entry(document, key, settings, comment)]

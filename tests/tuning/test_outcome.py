@@ -19,7 +19,7 @@ from sb3_sparse.cli.tuneprogress import TuningProgress
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.tuning import tune, write_report
 from sb3_sparse.tuning.backend import TrialState, optuna
-from sb3_sparse.tuning.best import best_settings, write_best, write_into
+from sb3_sparse.tuning.best import best_settings, check_target, write_best, write_into
 from sb3_sparse.tuning.report import report_on
 from sb3_sparse.tuning.storage import open_storage
 from sb3_sparse.tuning.study import TICKET, enter_study, standing_of
@@ -147,6 +147,16 @@ def test_where_sparsity_is_searched_the_report_names_the_best(storage, tmp_path)
     page = write_report([study], storage, tmp_path / "page.html").read_text()
     assert "rigl at 75%" in page
     assert "rigl at 90%" not in page
+
+
+def test_what_cannot_take_the_values_is_refused_before_the_search(tmp_path):
+    path = tmp_path / "mine.yml"
+    path.write_text(
+        "CartPole-v1: {n_timesteps: 9, policy: sb3_sparse.SparsePolicy, policy_kwargs: "
+        "{sparsity: 0.9}, callback: [{sb3_sparse.SparsityCallback: {method: rigl}}]}\n"
+    )
+    with pytest.raises(ConfigError, match="it is no block of its own; take the tuned settings"):
+        check_target(small_run(), path)
 
 
 def test_a_config_of_another_method_is_left_alone(study, tmp_path):

@@ -127,6 +127,16 @@ def test_a_function_may_search_what_depends_on_other_values(tmp_path):
     [
         ({}, dict(weight_decai=[0.0]), "has no hyperparameter 'weight_decai'; did you mean"),
         ({}, dict(n_timesteps=[10, 20]), "trials are compared at equal numbers of steps"),
+        (
+            dict(hyperparams={"n_envs": 2}),
+            dict(n_envs=[1, 2]),
+            "varies n_envs, which is also fixed",
+        ),
+        (
+            dict(hyperparams={"sparsity": 0.5}),
+            dict(sparsity=[0.5, 0.9]),
+            "which is also fixed to 0.5",
+        ),
         (dict(n_envs=2), dict(n_envs=[1, 2]), "varies n_envs, which is also fixed to 2"),
         ({}, dict(distribution=["erk", "banana"]), "banana"),
         ({}, dict(weight_decay=[0.0, "1e-4"]), "weight_decay is the text '1e-4'"),
@@ -203,6 +213,13 @@ def ranges() -> Space:
 def test_what_does_not_go_together(make, message):
     with pytest.raises(ConfigError, match=message):
         make()
+
+
+def test_a_sparsity_that_is_searched_is_no_part_of_the_name():
+    assert definition().default_name == "dqn_CartPole-v1_rigl_0.9_paper"
+    of = optuna.distributions.FloatDistribution
+    searched = definition(Space("mine", {"sparsity": of(0.5, 0.9)}), sampler="tpe")
+    assert searched.default_name == "dqn_CartPole-v1_rigl_mine"
 
 
 def test_how_many_trials_unless_one_says_so():

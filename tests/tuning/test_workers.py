@@ -284,6 +284,8 @@ def test_a_storage_that_cannot_be_reached_is_named_without_its_password(tmp_path
             "postgresql://u:s3cr@t3@127.0.0.1:9/x",
             "more than one @; write an @ in a password as",
         ),
+        ("postgresql://u:s3?cr@t3@127.0.0.1:9/x", "more than one @; write an @ in a password as"),
+        ("sqlite://", "lives in one process alone, and workers are processes; name a file"),
         ("postgresql://u:p:s3cret@127.0.0.1:t3/x", "is not known, or the rest of its URL is not"),
     ],
 )
@@ -374,6 +376,24 @@ def test_names_that_are_no_folders_are_refused(tmp_path, name):
     with pytest.raises(ConfigError, match="a study cannot be named"):
         tune(small_run(), choices(**GRID), log_folder=tmp_path, name=name, launcher=NoWorkers())
     assert not list(tmp_path.iterdir())
+
+
+def test_a_lock_of_a_dead_process_is_taken_over_and_that_of_a_live_one_is_not(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setattr("sb3_sparse.tuning.study.PATIENCE", 1.0)
+    storage = open_storage(tmp_path / "j.log")
+    lock = optuna.create_study(storage=storage, study_name="study is being filled")
+    definition = define(small_run(), choices(**GRID), 1, None, None, tmp_path)
+    entered = threading.Thread(target=enter_study, args=(storage, "study", definition, 6))
+    entered.start()
+    for _ in range(8):
+        time.sleep(0.4)
+        lock.set_user_attr("alive", time.time())
+        assert entered.is_alive()
+    entered.join(timeout=20)
+    assert not entered.is_alive()
+    assert [summary.study_name for summary in storage.get_all_studies()] == ["study"]
 
 
 def test_sqlite_works_too(tmp_path):

@@ -129,6 +129,7 @@ def test_an_entry_that_others_take_their_values_from_is_left_alone():
         "Hopper-v5: &h\n  gamma: 0.5\nAnt-v5: *h\nOther: {a: 1}\n",
         "Ant-v5:\n  gamma: 0.5\n  gamma: 0.6\n",
         "Hopper-v5:\n  gamma: 0.5\n...\n",
+        "Hopper-v5: &h\n  gamma: 0.5\nAnt-v5: *h\n",
     ],
 )
 def test_what_cannot_be_changed_line_by_line_is_refused(text):
