@@ -19,7 +19,7 @@ class RayLauncher(Launcher):
     """Each task as a Ray task that asks for one CPU; Ray places them, here or elsewhere.
 
     Every machine of the cluster needs the same version of this package and sees the same folders
-    and storage. What is given is joined: a cluster that this process has connected to already.
+    and storage. Where this process is connected to a cluster already, that one is taken.
 
     :param address: of the cluster, e.g. ``"auto"`` or ``"ray://head:10001"``; None: a cluster of
         this machine alone, for as long as the tasks run

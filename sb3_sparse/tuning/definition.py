@@ -12,7 +12,7 @@ from sb3_sparse.errors import ConfigError
 from sb3_sparse.tuning.backend import optuna
 from sb3_sparse.tuning.objective import check_seeds, planned_evaluations
 from sb3_sparse.tuning.samplers import pruner_of, sampler_of
-from sb3_sparse.tuning.spaces import Space, check_space, many_samples_of, with_values
+from sb3_sparse.tuning.spaces import Space, check_space, one_of_each, with_values
 from sb3_sparse.zoo.run import Run
 from sb3_sparse.zoo.settings import method_of, policy_kwargs_of
 
@@ -67,7 +67,7 @@ class Definition:
         sparsity = policy_kwargs_of(self.run.settings())["sparsity"]
         shares = sparsity.values() if isinstance(sparsity, Mapping) else [sparsity]
         parts = [self.run.algo, self.run.env_id.replace("/", "-"), self.method]
-        searched = "sparsity" in many_samples_of(self.space)
+        searched = "sparsity" in one_of_each(self.space)
         if self.method != "dense" and not searched:
             parts += [f"{share:g}" for share in shares]
         return "_".join([*parts, self.space.name])
@@ -114,7 +114,7 @@ class Definition:
             "sampler": self.sampler,
             "pruner": self.pruner,
             "compute": self.compute,
-            "settings": with_values(self.run, many_samples_of(self.space)).settings(),
+            "settings": with_values(self.run, one_of_each(self.space)).settings(),
             "evaluation": self.run.evaluation(),
         }
 

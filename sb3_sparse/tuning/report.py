@@ -9,7 +9,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from sb3_sparse.errors import ConfigError, MissingExtra
+from sb3_sparse.errors import ConfigError, MissingExtra, SparsityError
 from sb3_sparse.tuning.backend import BaseStorage, FrozenTrial, TrialState, optuna
 from sb3_sparse.tuning.definition import Definition
 from sb3_sparse.tuning.objective import VALUES
@@ -151,12 +151,16 @@ def _scores(trial: FrozenTrial) -> str:
 
 def _best_by_method(studies: Sequence[optuna.Study], storage: BaseStorage) -> str:
     tasks = {_task(definition_of(study)) for study in studies}
-    rows = []
+    rows, unread = [], ""
     for summary in storage.get_all_studies():
         if DEFINITION not in summary.user_attrs:
             continue
         study = optuna.load_study(storage=storage, study_name=summary.study_name)
-        definition, standing = definition_of(study), standing_of(study)
+        try:
+            definition, standing = definition_of(study), standing_of(study)
+        except SparsityError as error:  # e.g. of an environment or method that is not here
+            unread += f"<p>Left out: {escape(f'{summary.study_name}: {error}')}</p>\n"
+            continue
         if _task(definition) not in tasks or standing.best is None:
             continue
         values = standing.best.user_attrs[VALUES]
@@ -166,7 +170,7 @@ def _best_by_method(studies: Sequence[optuna.Study], storage: BaseStorage) -> st
         rows.append([*row, study.study_name])
     heads = ["algorithm", "environment", "steps", "method", "best score", "with", "completed"]
     table = _table([*heads, "seeds a trial", "study"], sorted(rows, key=str))
-    return f"<h2>Best of each method</h2>\n{table}"
+    return f"<h2>Best of each method</h2>\n{table}\n{unread}"
 
 
 def _task(definition: Definition) -> tuple[str, str, int]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Set
+from contextlib import suppress
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
@@ -19,6 +20,7 @@ FloatDistribution = optuna.distributions.FloatDistribution
 IntDistribution = optuna.distributions.IntDistribution
 
 OF_SPARSE_POLICIES = frozenset({"sparsity", "distribution", "actor_share", "sparsity_aware_init"})
+BRANCHES = 32
 OPTIONS = ("sparsity", "distribution", "n_envs")  # of a run, beside its hyperparams
 OF_METHODS = frozenset({"update_interval", "drop_fraction", "begin", "end", "update_on"})
 
@@ -55,7 +57,15 @@ class Space:
         return {name: _suggest(trial, name, d) for name, d in self.distributions.items()}
 
     def _call(self, trial: Trial) -> dict[str, Any]:
-        values = run_code(str(self.code), self.name)(trial)
+        function = run_code(str(self.code), self.name)
+        try:
+            values = function(trial)
+        except optuna.TrialPruned:
+            raise
+        except Exception as error:
+            raise ConfigError(
+                f"space(trial) in {self.name} fails: {type(error).__name__}: {error}"
+            ) from error
         if not isinstance(values, Mapping) or not values:
             raise ConfigError(
                 f"space(trial) in {self.name} must return the sampled values by name, e.g. "
@@ -128,37 +138,46 @@ def with_values(run: Run, values: Mapping[str, Any]) -> Run:
     return replace(run, hyperparams={**run.hyperparams, **values})
 
 
-def sample_of(space: Space) -> dict[str, Any]:
-    """One sample of a space, always the same."""
+def samples_of(space: Space) -> list[dict[str, Any]]:
+    """Samples of a space, always the same; of a function so many that its branches are seen."""
     study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
-    return space.sample(study.ask())
+    samples = []
+    for _ in range(1 if space.code is None else BRANCHES):
+        with suppress(optuna.TrialPruned):  # a function may refuse what it has drawn
+            samples.append(space.sample(study.ask()))
+    return samples
 
 
-def many_samples_of(space: Space) -> dict[str, Any]:
-    """A value of each name that the space may give, those of a function's branches too."""
-    study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
-    values: dict[str, Any] = {}
-    for _ in range(32):
-        values.update(space.sample(study.ask()))
-    return values
+def one_of_each(space: Space) -> dict[str, Any]:
+    """A value of each name that the space may give."""
+    return {name: value for values in samples_of(space) for name, value in values.items()}
 
 
 def check_space(space: Space, run: Run) -> None:
     """Refuse a space that the run has no place for, before anything is trained.
 
-    Tries a sample, and every choice and both ends of every range in it.
+    Tries samples, and every choice and both ends of every range in one.
 
     :raises ConfigError: for a name that the algorithm, the policy or the method does not have, one
         that the run itself has fixed, or a value that is not allowed
     """
-    values = sample_of(space)
+    samples = samples_of(space)
+    _check_names(space, run, {name for values in samples for name in values})
+    for values in samples:
+        _check_settings(with_values(run, values).settings())
+    for name, distribution in space.distributions.items():
+        for value in _extremes(distribution):
+            _check_settings(with_values(run, {**samples[0], name: value}).settings())
+
+
+def _check_names(space: Space, run: Run, names: Set[str]) -> None:
+    if "n_timesteps" in names:
+        raise ConfigError(
+            f"the search space {space.name!r} varies n_timesteps, but trials are compared at equal "
+            "numbers of steps; leave it out and give -n"
+        )
     fixed = {**{name: getattr(run, name) for name in OPTIONS}, **run.hyperparams}
-    for name in values:
-        if name == "n_timesteps":
-            raise ConfigError(
-                f"the search space {space.name!r} varies n_timesteps, but trials are compared at "
-                "equal numbers of steps; leave it out and give -n"
-            )
+    for name in sorted(names):
         if fixed.get(name) is not None:
             raise ConfigError(
                 f"the search space {space.name!r} varies {name}, which is also fixed to "
@@ -166,18 +185,14 @@ def check_space(space: Space, run: Run) -> None:
             )
     method = method_of(run.settings())
     if method == DENSE:
-        absent = (OF_SPARSE_POLICIES | OF_METHODS) & values.keys()
+        absent = (OF_SPARSE_POLICIES | OF_METHODS) & names
     else:
-        absent = (OF_METHODS & values.keys()) - method_named(method).options
+        absent = (OF_METHODS & names) - method_named(method).options
     if absent:
         raise ConfigError(
             f"method {method!r} has no {', '.join(sorted(absent))}, which the search space "
             f"{space.name!r} varies; leave it out there, or tune another method"
         )
-    _check_settings(with_values(run, values).settings())
-    for name, distribution in space.distributions.items():
-        for value in _extremes(distribution):
-            _check_settings(with_values(run, {**values, name: value}).settings())
 
 
 def _extremes(distribution: BaseDistribution) -> tuple[Any, ...]:

@@ -59,6 +59,7 @@ def _alone(storage: BaseStorage, name: str) -> Iterator[Callable[[], None]]:
     while True:
         try:
             held = optuna.create_study(storage=storage, study_name=lock)
+            held_id = storage.get_study_id_from_name(lock)
             break
         except optuna.exceptions.DuplicatedStudyError:
             sign = _sign_of(storage, lock)
@@ -70,7 +71,7 @@ def _alone(storage: BaseStorage, name: str) -> Iterator[Callable[[], None]]:
     try:
         yield lambda: held.set_user_attr(SIGN, time.time())
     finally:
-        _delete(storage, storage.get_study_id_from_name(lock))
+        _delete(storage, held_id)  # and no other's, should this one have been taken for dead
 
 
 def _sign_of(storage: BaseStorage, lock: str) -> tuple[int, Any] | None:

@@ -22,7 +22,7 @@ from sb3_sparse.tuning.backend import TrialState, optuna
 from sb3_sparse.tuning.best import best_settings, check_target, write_best, write_into
 from sb3_sparse.tuning.report import report_on
 from sb3_sparse.tuning.storage import open_storage
-from sb3_sparse.tuning.study import TICKET, enter_study, standing_of
+from sb3_sparse.tuning.study import DEFINITION, TICKET, enter_study, standing_of
 from sb3_sparse.tuning.tune import define
 from sb3_sparse.zoo.configs import config_path
 from sb3_sparse.zoo.run import Run
@@ -128,6 +128,14 @@ def test_a_study_needs_its_config_no_more(storage, study, tmp_path):
     path.unlink()
     assert "<h2>mine</h2>" in report_on(["mine"], None, tmp_path, None).read_text()
     assert best_settings(other)["gamma"] == 0.99
+
+
+def test_a_study_that_cannot_be_read_here_is_named_and_spoils_no_page(storage, study, tmp_path):
+    other = finished(storage, "other", decay_matters)
+    known = other.user_attrs[DEFINITION]
+    other.set_user_attr(DEFINITION, {**known, "run": {**known["run"], "env_id": "Gone-v0"}})
+    page = write_report([study], storage, tmp_path / "page.html").read_text()
+    assert re.search("<p>Left out: other: .*Gone-v0", page)
 
 
 def test_a_link_stays_a_link_and_modes_stay(storage, tmp_path):

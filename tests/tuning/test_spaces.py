@@ -170,6 +170,14 @@ def test_a_space_that_the_run_has_no_place_for_is_refused(run, space, message):
         ("a.py", "x = 1", "a.py must define `space`"),
         ("a.py", "space = {}", "the search space 'a' is empty"),
         ("a.py", "1 / 0", "a.py fails: ZeroDivisionError"),
+        ("a.py", "space = lambda trial: 1 / 0", r"space\(trial\) in a fails: ZeroDivisionError"),
+        (
+            "a.py",
+            "def space(trial):\n"
+            "    good = trial.suggest_categorical('good', [True, False])\n"
+            "    return {'gamma': 0.9} if good else {'colour': 1}\n",
+            "has no hyperparameter 'colour'",
+        ),
         ("a.py", "space = lambda trial: {}", r"space\(trial\) in a must return the sampled values"),
         ("a.txt", "", "unknown search space '.*a.txt'; allowed are paper, wide, or a file"),
     ],
