@@ -40,6 +40,7 @@ EDGES = {
     "matplotlib": {"report"},
     "rliable": {"report"},
     "onnx": {"export"},
+    "onnxruntime": {"export"},
     "ray": {"launch"},
     "sqlalchemy": {"tuning"},
     "plotly": {"tuning"},

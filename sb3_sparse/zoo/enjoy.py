@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecVideoRecorder
@@ -17,6 +16,7 @@ from stable_baselines3.common.vec_env import VecVideoRecorder
 from sb3_sparse.errors import ConfigError, MissingExtra
 from sb3_sparse.zoo.environments import is_atari, known_environment
 from sb3_sparse.zoo.experiment import load_for_prediction, quiet, test_env
+from sb3_sparse.zoo.saved import arguments_of, model_in
 
 VIDEO_STEPS = 1000
 
@@ -53,19 +53,11 @@ def enjoy(
     """
     if episodes < 1:
         raise ConfigError(f"episodes must be 1 or more, got {episodes}")
-    arguments = _arguments_of(folder)
+    arguments = arguments_of(folder)
     algo, env_id = arguments["algo"], arguments["env"]
     known_environment(env_id)
     env_name = env_id.replace("/", "-")
-    path = folder / ("best_model.zip" if best else f"{env_name}.zip")
-    if not path.is_file():
-        models = ", ".join(sorted(file.name for file in folder.glob("*.zip"))) or "none"
-        why = (
-            "there is a best policy after the first evaluation at the sparsity asked for"
-            if best
-            else "a run that was killed has its last policy after sb3-sparse train --resume"
-        )
-        raise ConfigError(f"{folder} has no {path.name} (its models: {models}): {why}")
+    path = model_in(folder, env_id, best)
     if video and importlib.util.find_spec("moviepy") is None:
         raise MissingExtra("recording a video", "video")
     if video and sys.platform == "linux" and not os.environ.get("DISPLAY"):
@@ -104,16 +96,3 @@ def enjoy(
     assert not isinstance(std, list)
     videos = tuple(sorted((folder / "videos").glob(f"{path.stem}*"))) if video else ()
     return Score(path, float(mean), float(std), episodes, videos)
-
-
-def _arguments_of(folder: Path) -> dict[str, Any]:
-    """What the run was started with, from the file that rl-zoo writes."""
-    files = list(folder.glob("*/args.yml"))
-    if len(files) != 1:
-        raise ConfigError(
-            f"there is no run in {folder}; give the run's own folder, e.g. "
-            "logs/sac/HalfCheetah-v5_1"
-        )
-    # rl-zoo writes Python objects into it
-    arguments = yaml.load(files[0].read_text(), Loader=yaml.UnsafeLoader)
-    return dict(arguments)

@@ -168,6 +168,15 @@ def test_env(env_id: str, params: Path, env_kwargs: dict[str, Any], seed: int) -
     return env
 
 
+def saved_settings(params: Path) -> dict[str, Any]:
+    """The settings in a run's ``config.yml``; empty if it has none.
+
+    :param params: folder of the run's ``config.yml`` and normalisation
+    """
+    settings: dict[str, Any] = get_saved_hyperparams(str(params))[0]
+    return settings
+
+
 def load_for_prediction(algo: str, path: Path) -> BaseAlgorithm:
     """A saved model without its replay buffer."""
     kwargs: dict[str, Any] = {}

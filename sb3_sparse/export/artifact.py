@@ -1,0 +1,172 @@
+"""What each format writes, and how it is run to be checked."""
+
+from __future__ import annotations
+
+import ctypes
+import io
+import os
+import shlex
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_sparse.errors import MissingExtra, UnsupportedError
+from sb3_sparse.export import numpy_policy
+from sb3_sparse.export.c import write_c
+from sb3_sparse.export.dense import write_dense
+from sb3_sparse.export.graph import Graph
+from sb3_sparse.export.npz import write_npz
+from sb3_sparse.export.parity import Actor
+from sb3_sparse.export.units import sort_units
+from sb3_sparse.policies.mixin import SparsePolicyMixin
+
+COMPILERS = ("cc", "gcc", "clang")
+OPTIONS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror")
+
+
+@dataclass(frozen=True)
+class Artifact:
+    """An exported policy, not yet on disk.
+
+    :param files: contents by name; a name that begins with a dot is the suffix of the main file
+    :param actor: runs it
+    :param notes: what its user must know
+    :param sizes: bytes of what it takes where it runs, by kind
+    """
+
+    files: dict[str, bytes]
+    actor: Callable[[], Actor]
+    notes: tuple[str, ...] = ()
+    sizes: dict[str, int] = field(default_factory=dict)
+
+
+def c_artifact(graph: Graph, version: str, int8: bool) -> Artifact:
+    """A C file and its header."""
+    written = write_c(sort_units(graph), version, int8)
+    return Artifact(
+        {".c": written.source.encode(), ".h": written.header.encode()},
+        lambda: compiled(written.source, graph),
+        sizes={"flash": written.flash, "RAM": written.ram},
+    )
+
+
+def numpy_artifact(graph: Graph) -> Artifact:
+    """A .npz file and its loader."""
+    content = write_npz(graph)
+    loader = Path(numpy_policy.__file__).read_bytes()
+
+    def actor() -> Actor:
+        policy: Any = numpy_policy.Policy(io.BytesIO(content))  # type: ignore[no-untyped-call]
+        return lambda observations: policy(observations).reshape(len(observations), -1)
+
+    return Artifact({".npz": content, Path(numpy_policy.__file__).name: loader}, actor)
+
+
+def onnx_artifact(graph: Graph, version: str) -> Artifact:
+    """An ONNX model."""
+    from sb3_sparse.export.onnx_model import write_onnx
+
+    content = write_onnx(graph, version)
+
+    def actor() -> Actor:
+        try:
+            import onnxruntime
+        except ImportError as error:
+            raise MissingExtra("checking an ONNX model", "export") from error
+        session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
+        kind = np.uint8 if graph.images else np.float32
+
+        def run(observations: NDArray[Any]) -> NDArray[Any]:
+            (actions,) = session.run(None, {"obs": observations.astype(kind)})
+            return np.asarray(actions).reshape(len(observations), -1)
+
+        return run
+
+    return Artifact({".onnx": content}, actor)
+
+
+def dense_artifact(model: BaseAlgorithm, normalization: VecNormalize | None) -> Artifact:
+    """A zip of stock SB3."""
+    content = write_dense(model)
+
+    def actor() -> Actor:
+        small: Any = {"buffer_size": 1} if hasattr(model, "buffer_size") else {}
+        stock = type(model).load(io.BytesIO(content), device="cpu", **small)
+        return predictor(stock, normalization)
+
+    notes = ["trained on in stock SB3, it is dense: nothing keeps the zeros"]
+    if normalization is not None:
+        notes.append(
+            "a zip of SB3 does not normalise observations: load the statistics with "
+            "VecNormalize.load, as before"
+        )
+    if isinstance(model.policy, SparsePolicyMixin) and model.policy.sparse.weight_decay:
+        notes.append("weight_decay, which is of sparse policies, is left out")
+    return Artifact({".zip": content}, actor, tuple(notes))
+
+
+def predictor(model: BaseAlgorithm, normalization: VecNormalize | None) -> Actor:
+    """A model's own ``predict``, behind its normalisation."""
+
+    def run(observations: NDArray[Any]) -> NDArray[Any]:
+        seen: Any = observations
+        if normalization is not None:
+            seen = normalization.normalize_obs(observations)
+        actions, _ = model.predict(seen, deterministic=True)
+        return np.asarray(actions).reshape(len(observations), -1)
+
+    return run
+
+
+def compiler() -> list[str]:
+    """The command of this machine's C compiler: ``$CC``, else cc, gcc or clang.
+
+    :raises UnsupportedError: if there is none
+    """
+    command = shlex.split(os.environ.get("CC", ""))
+    names = [command[0]] if command else list(COMPILERS)
+    for name in names:
+        found = shutil.which(name)
+        if found is not None:
+            return [found, *command[1:]]
+    raise UnsupportedError(
+        f"a C export is compiled and run to check it, but there is no {' or '.join(names)} here; "
+        "install gcc or clang, name a compiler in the environment variable CC, or write it "
+        "unchecked with force (--force)"
+    )
+
+
+def compiled(source: str, graph: Graph, options: tuple[str, ...] = OPTIONS) -> Actor:
+    """Compile a policy and run it through ctypes.
+
+    :param graph: for the sizes of observation and action
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        path, library = Path(folder) / "policy.c", Path(folder) / "policy.so"
+        path.write_text(source)
+        command = [*compiler(), *options, "-shared", "-fPIC", str(path), "-o", str(library), "-lm"]
+        done = subprocess.run(command, capture_output=True, text=True)
+        if done.returncode:
+            raise RuntimeError(f"the C export does not compile:\n{done.stderr}")
+        function = ctypes.CDLL(str(library)).sb3_sparse_policy
+    numbers = ctypes.POINTER(ctypes.c_float)
+    function.argtypes, function.restype = [numbers, numbers], None
+    count = graph.nodes[-1].shape[0]
+
+    def run(observations: NDArray[Any]) -> NDArray[Any]:
+        rows = np.ascontiguousarray(observations.reshape(len(observations), -1), np.float32)
+        actions = np.empty((len(rows), count), np.float32)
+        for row, action in zip(rows, actions, strict=True):
+            function(row.ctypes.data_as(numbers), action.ctypes.data_as(numbers))
+        return actions
+
+    return run

@@ -1,0 +1,292 @@
+"""A policy as one C99 file that depends on nothing, and its header."""
+
+from __future__ import annotations
+
+import textwrap
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_sparse.export import ckernels
+from sb3_sparse.export.graph import (
+    Activation,
+    Add,
+    Affine,
+    Argmax,
+    Clip,
+    Conv,
+    Flatten,
+    Graph,
+    Linear,
+    MaxPool,
+    Node,
+    Normalize,
+    Positive,
+    Weighted,
+)
+from sb3_sparse.export.layout import grouped, side_by_side
+from sb3_sparse.export.memory import Memory, bordered_shape, plan_memory
+from sb3_sparse.export.quantize import quantize_rows
+
+PROTOTYPE = "void sb3_sparse_policy(const float *obs, float *action)"
+WIDTH = 100
+BYTES = {"float": 4, "int8_t": 1, "uint16_t": 2, "uint32_t": 4}
+
+
+@dataclass(frozen=True)
+class CSource:
+    """A C file and its header.
+
+    :param source: text of the ``.c`` file
+    :param header: text of the ``.h`` file
+    :param flash: bytes of its constants; the code comes on top, some 1 to 3 KB
+    :param ram: bytes of its static memory; observation and action are the caller's
+    """
+
+    source: str
+    header: str
+    flash: int
+    ram: int
+
+
+def write_c(graph: Graph, version: str, int8: bool = False) -> CSource:
+    """C99 of a graph.
+
+    :param graph: the policy; its hidden units are best sorted
+    :param version: of this package, for the files' first lines
+    :param int8: weights as 8-bit whole numbers with a scale for each row.
+    """
+    writer = _Writer(graph, plan_memory(graph), int8)
+    for number, node in enumerate(graph.nodes):
+        writer.write(number + 1, node)
+    tables = "\n".join(writer.tables)
+    functions = "\n".join(writer.functions.values())
+    body = "\n".join(f"    {line}" for line in writer.calls)
+    ram = 4 * writer.memory.size
+    memory = f"static float memory[{writer.memory.size}];\n\n" if ram else ""
+    observations, actions = int(np.prod(graph.observation_shape)), graph.nodes[-1].shape[0]
+    about = [
+        f"A policy of {graph.nnz} connections, written by sb3_sparse {version}.",
+        f"Flash: {writer.flash} bytes of constants, and the code. RAM: {ram} bytes, no heap.",
+        f"In: one observation of {_shape(graph.observation_shape)}, raw.",
+        f"Out: {_what(graph, actions)}.",
+    ]
+    comment = "/*\n" + "".join(f" * {line}\n" for line in about) + " */\n"
+    includes = "#include <stdint.h>\n"
+    if any(name in functions for name in ("tanhf", "expm1f")):
+        includes = "#include <math.h>\n" + includes
+    if "SB3_SPARSE_AVX2" in functions:
+        includes += (
+            "#ifdef SB3_SPARSE_AVX2 /* needs -mavx2 -mfma */\n#include <immintrin.h>\n#endif\n"
+        )
+    source = (
+        f"{comment}{includes}\n{PROTOTYPE};\n\n{memory}{functions}\n{tables}\n\n"
+        f"{PROTOTYPE}\n{{\n{body}\n}}\n"
+    )
+    header = (
+        f"{comment}#ifndef SB3_SPARSE_POLICY_H\n#define SB3_SPARSE_POLICY_H\n\n"
+        f"#define SB3_SPARSE_OBSERVATION_SIZE {observations}\n"
+        f"#define SB3_SPARSE_ACTION_SIZE {actions}\n\n"
+        '#ifdef __cplusplus\nextern "C" {\n#endif\n\n'
+        "/* Not reentrant: its intermediate values are static. */\n"
+        f"{PROTOTYPE};\n\n"
+        "#ifdef __cplusplus\n}\n#endif\n\n#endif\n"
+    )
+    return CSource(source, header, writer.flash, ram)
+
+
+class _Writer:
+    """Collects functions, tables and calls."""
+
+    def __init__(self, graph: Graph, memory: Memory, int8: bool) -> None:
+        self.graph = graph
+        self.memory = memory
+        self.int8 = int8
+        self.flash = 0
+        self.functions: dict[str, str] = {}
+        self.tables: list[str] = []
+        self.calls: list[str] = []
+
+    def write(self, value: int, node: Node) -> None:
+        """Append what computes a node's result."""
+        self.value = value
+        x, y = self._place(node.inputs[0]), self._place(value)
+        if isinstance(node, Linear):
+            self._linear(node, x, y)
+        elif isinstance(node, Conv):
+            self._conv(node, x, y)
+        elif isinstance(node, MaxPool):
+            self._max_pool(node, x, y)
+        elif isinstance(node, Argmax):
+            self.functions["argmax"] = ckernels.ARGMAX
+            sizes = self._table("sizes", node.sizes, "uint16_t")
+            self.calls.append(f"argmax({x}, {y}, {len(node.sizes)}, {sizes});")
+        elif isinstance(node, (Affine, Clip)):
+            places = int(np.prod(node.shape[1:]))
+            self._elementwise(node, x, y, f"{node.shape[0]}, {places}", node.fields())
+        elif isinstance(node, Normalize):
+            fields = node.fields()
+            fields["clip"] = np.array(node.clip, np.float32)
+            self._elementwise(node, x, y, _size(node), fields)
+        elif isinstance(node, Activation):
+            fields = node.fields() if node.kind in ("leaky_relu", "elu") else {}
+            self._elementwise(node, x, y, _size(node), fields)
+        elif isinstance(node, Add):
+            self._elementwise(node, x, y, f"{_size(node)}, {self._place(node.inputs[1])}", {})
+        elif isinstance(node, Positive):
+            self._elementwise(node, x, y, _size(node), {})
+        else:
+            assert isinstance(node, Flatten)  # the same numbers in the same order
+
+    def _elementwise(
+        self, node: Node, x: str, y: str, size: str, fields: dict[str, NDArray[Any]]
+    ) -> None:
+        arguments = [
+            self._table(name, field, "float") if field.ndim else _number(field)
+            for name, field in fields.items()
+        ]
+        if isinstance(node, (Clip, Normalize)):
+            self.functions["clipped"] = ckernels.CLIPPED
+        self.functions[node.name] = ckernels.elementwise(node.name)
+        name = ckernels.c_name(node.name)
+        self.calls.append(f"{name}({', '.join([x, y, size, *arguments])});")
+
+    def _linear(self, layer: Linear, x: str, y: str) -> None:
+        rows, scales = self._rows(layer)
+        bits = self._bits(layer.weight.shape[1])
+        if rows.size * self._width <= np.count_nonzero(rows) * (self._width + bits // 8):
+            name = "linear_dense" + "_int8" * self.int8
+            self.functions[name] = ckernels.linear(name, None, self.int8)
+            tables = [self._table("value", side_by_side(rows), self._type)]
+            size = f"{rows.shape[0]}, {rows.shape[1]}"
+        else:
+            name = f"linear_{bits}" + "_int8" * self.int8
+            self.functions[name] = ckernels.linear(name, bits, self.int8)
+            lengths, columns, values = grouped(rows)
+            index = ckernels.INDEX_TYPES[bits]
+            tables = [
+                self._table("length", lengths, index),
+                self._table("column", columns, index),
+                self._table("value", values, self._type),
+            ]
+            size = str(rows.shape[0])
+        if self.int8:
+            tables.append(self._table("scale", scales, "float"))
+        tables.append(self._table("bias", layer.bias, "float"))
+        self.calls.append(f"{name}({', '.join([x, y, size, *tables])});")
+
+    def _conv(self, layer: Conv, x: str, y: str) -> None:
+        x, shape = self._bordered(layer, x, 0.0)
+        rows, scales = self._rows(layer)
+        _, inputs, height, width = layer.weight.shape
+        across = shape[2]
+        places = np.arange(int(np.prod(shape))).reshape(shape)[:, :height, :width].reshape(-1)
+        bits = self._bits(int(np.prod(shape)))
+        full = bool((rows != 0).all())
+        index = ckernels.INDEX_TYPES[bits]
+        name = f"conv_{bits}" + "_full" * full + "_int8" * self.int8
+        self.functions[name] = ckernels.conv(name, bits, full, self.int8)
+        active = [np.flatnonzero(row) for row in rows]
+        if full:
+            tables = [str(rows.shape[1]), self._table("offset", places, index)]
+        else:
+            tables = [
+                self._table("length", [len(found) for found in active], index),
+                self._table("offset", np.concatenate([places[found] for found in active]), index),
+            ]
+        values = np.concatenate([row[found] for row, found in zip(rows, active, strict=True)])
+        tables.append(self._table("value", values, self._type))
+        if self.int8:
+            tables.append(self._table("scale", scales, "float"))
+        tables.append(self._table("bias", layer.bias, "float"))
+        units, rows_out, columns_out = layer.shape
+        down, right = across * layer.stride[0], layer.stride[1]
+        size = f"{units}, {rows_out}, {columns_out}, {down}, {right}"
+        self.calls.append(f"{name}({', '.join([x, y, size, *tables])});")
+
+    def _max_pool(self, node: MaxPool, x: str, y: str) -> None:
+        self.functions["max_pool"] = ckernels.MAX_POOL
+        x, (_, height, width) = self._bordered(node, x, -float(np.finfo(np.float32).max))
+        sizes = [*node.shape, height * width, width, width * node.stride[0], node.stride[1]]
+        numbers = ", ".join(map(str, [*sizes, *node.kernel]))
+        self.calls.append(f"max_pool({x}, {y}, {numbers});")
+
+    def _bordered(self, node: Conv | MaxPool, x: str, border: float) -> tuple[str, tuple[int, ...]]:
+        """A node's input with a border around, where it needs one, and the shape of that."""
+        shape = self.graph.shape_of(node.inputs[0])
+        with_border = bordered_shape(node, shape)
+        if with_border is None:
+            return x, shape
+        self.functions["bordered"] = ckernels.BORDERED
+        y = f"memory + {self.memory.borders[self.value]}"
+        sizes = ", ".join(map(str, [*shape, *node.padding]))
+        self.calls.append(f"bordered({x}, {y}, {sizes}, {_number(border)});")
+        return y, with_border
+
+    def _rows(self, layer: Weighted) -> tuple[NDArray[Any], NDArray[Any]]:
+        """A layer's weights as they are written, by rows, and the scale of each row."""
+        if self.int8:
+            return quantize_rows(layer.rows)
+        return layer.rows, np.ones(len(layer.rows), np.float32)
+
+    @property
+    def _type(self) -> str:
+        return "int8_t" if self.int8 else "float"
+
+    @property
+    def _width(self) -> int:
+        return BYTES[self._type]
+
+    @staticmethod
+    def _bits(count: int) -> int:
+        return 16 if count <= 2**16 else 32
+
+    def _place(self, value: int) -> str:
+        if value == 0:
+            return "obs"
+        if value == len(self.graph.nodes):
+            return "action"
+        if value not in self.memory.places:  # an observation that was only flattened
+            return self._place(self.graph.nodes[value - 1].inputs[0])
+        return f"memory + {self.memory.places[value]}"
+
+    def _table(self, name: str, numbers: Any, kind: str) -> str:
+        """Append a constant array; its name."""
+        flat = np.asarray(numbers).reshape(-1)
+        name = f"{name}_{self.value}"
+        if not flat.size:
+            flat = np.zeros(1, flat.dtype)  # C has no arrays of length 0
+        self.flash += flat.size * BYTES[kind]
+        texts = map(_number, flat) if kind == "float" else map(str, flat.tolist())
+        lines = textwrap.wrap(
+            ", ".join(texts), WIDTH - 4, break_long_words=False, break_on_hyphens=False
+        )
+        body = "\n".join(f"    {line}" for line in lines)
+        self.tables.append(f"static const {kind} {name}[{flat.size}] = {{\n{body}\n}};")
+        return name
+
+
+def _number(value: Any) -> str:
+    """A float's shortest literal that C reads back as the same one."""
+    text = str(np.float32(value))
+    return f"{text}f" if "." in text or "e" in text else f"{text}.0f"
+
+
+def _size(node: Node) -> str:
+    return str(int(np.prod(node.shape)))
+
+
+def _shape(shape: tuple[int, ...]) -> str:
+    return "x".join(map(str, shape))
+
+
+def _what(graph: Graph, actions: int) -> str:
+    last = graph.nodes[-1]
+    if isinstance(last, Argmax):
+        choices = ", ".join(map(str, last.sizes))
+        return f"{actions} whole number{'s' * (actions > 1)}, below {choices}"
+    if isinstance(last, Positive):
+        return f"{actions} times 0 or 1"
+    return f"{actions} number{'s' * (actions > 1)}, within the action space's bounds"

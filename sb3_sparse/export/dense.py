@@ -1,0 +1,112 @@
+"""A sparse model as a zip of stock SB3, which loads and trains on without this package."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import zipfile
+from typing import Any
+
+import stable_baselines3
+import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.save_util import is_json_serializable, load_from_zip_file
+
+from sb3_sparse.errors import UnsupportedError
+from sb3_sparse.export.pathless import pickled
+from sb3_sparse.policies.config import SparsityConfig
+from sb3_sparse.policies.named import import_named
+
+STOCK = ("stable_baselines3.", "sb3_contrib.")
+FORGOTTEN = (
+    "_last_obs",
+    "_last_original_obs",
+    "_last_episode_starts",
+    "ep_info_buffer",
+    "ep_success_buffer",
+    "tensorboard_log",
+    "start_time",
+)
+"""What a model remembers of where and when it was trained; ``learn`` makes it anew."""
+LONG_AGO = (1980, 1, 1, 0, 0, 0)
+
+
+def write_dense(model: BaseAlgorithm) -> bytes:
+    """Bytes of the zip: weights and optimizer moments, 0 where there is no connection.
+
+    Training on in stock SB3 is dense: nothing keeps the zeros.
+
+    :raises UnsupportedError: if the model has classes of this package that SB3 lacks
+    """
+    file = io.BytesIO()
+    model.save(file)
+    file.seek(0)
+    data, loaded, variables = load_from_zip_file(file, device="cpu")
+    assert data is not None
+    params: dict[str, Any] = dict(loaded)
+    data["policy_class"] = _stock_class(type(model.policy))
+    data["policy_kwargs"] = _stock_kwargs(model.policy, data["policy_kwargs"])
+    for name in FORGOTTEN:
+        if name in data:
+            data[name] = None
+    params["policy"] = {
+        key: value
+        for key, value in params["policy"].items()
+        if not key.endswith((".weight_mask", "_extra_state"))
+    }
+    return _zipped(data, params, variables)
+
+
+def _stock_class(policy: type[BasePolicy]) -> type[BasePolicy]:
+    for cls in policy.__mro__:
+        if cls.__module__.startswith(STOCK):
+            assert issubclass(cls, BasePolicy)
+            return cls
+    raise UnsupportedError(f"{policy.__name__} is no subclass of a policy of SB3 or sb3-contrib")
+
+
+def _stock_kwargs(policy: BasePolicy, kwargs: dict[str, Any]) -> dict[str, Any]:
+    """Policy arguments without those of sparse policies, the classes among them imported."""
+    sparse = {*SparsityConfig.__dataclass_fields__, "weight_decay"}
+    stock = {name: value for name, value in kwargs.items() if name not in sparse}
+    import_named(stock)
+    stock["features_extractor_class"] = policy.features_extractor_class
+    return stock
+
+
+def _zipped(data: dict[str, Any], params: Any, variables: Any) -> bytes:
+    """As SB3 writes it, but with the same bytes each time."""
+    texts = {name: _as_json(name, value) for name, value in data.items()}
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w") as archive:
+        _add(archive, "data", json.dumps(texts, indent=4).encode())
+        if variables is not None:
+            _add(archive, "pytorch_variables.pth", _saved(variables))
+        for name, state in params.items():
+            _add(archive, f"{name}.pth", _saved(state))
+        _add(archive, "_stable_baselines3_version", stable_baselines3.__version__.encode())
+    return file.getvalue()
+
+
+def _add(archive: zipfile.ZipFile, name: str, content: bytes) -> None:
+    archive.writestr(zipfile.ZipInfo(name, LONG_AGO), content)
+
+
+def _as_json(name: str, value: Any) -> Any:
+    if is_json_serializable(value):
+        return value
+    content = pickled(value)
+    if b"sb3_sparse" in content:
+        raise UnsupportedError(
+            f"the model's {name} is {value}, which needs sb3_sparse to be loaded; dense zips can "
+            "have SB3's own networks and classes of yours. Export to onnx, numpy or c instead"
+        )
+    return {":type:": str(type(value)), ":serialized:": base64.b64encode(content).decode()}
+
+
+def _saved(state: Any) -> bytes:
+    file = io.BytesIO()
+    th.save(state, file)
+    return file.getvalue()

@@ -1,0 +1,184 @@
+"""From an SB3 model to the graph of its deterministic actions."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.distributions import StateDependentNoiseDistribution
+from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.vec_env import VecNormalize
+from torch import nn
+
+from sb3_sparse.errors import CorruptStateError, UnsupportedError
+from sb3_sparse.export.graph import (
+    Affine,
+    Argmax,
+    Clip,
+    Graph,
+    Linear,
+    Normalize,
+    Positive,
+)
+from sb3_sparse.export.trace import Tracer
+from sb3_sparse.policies.aliases import supported_algorithms
+from sb3_sparse.policies.mixin import SparsePolicyMixin
+
+
+def graph_of(model: BaseAlgorithm, normalization: VecNormalize | None) -> Graph:
+    """The operations from a raw observation to the action of ``predict(deterministic=True)``.
+
+    :param model: of a supported algorithm, its policy sparse or stock
+    :param normalization: what normalises observations before the policy sees them
+    :raises UnsupportedError: for a network or space that cannot be exported
+    """
+    policy: Any = model.policy
+    policy.set_training_mode(False)
+    space = check_observations(model.observation_space)
+    tracer = Tracer(space.shape)
+    value = 0
+    if normalization is not None:
+        value = _normalize(tracer, normalization)
+    images = is_image_space(space)
+    if images and policy.normalize_images:
+        value = tracer.add(_scaled(value, space.shape, 1.0 / 255.0, 0.0))
+    for module in _modules(policy):
+        value = tracer.walk(module, value)
+    action = model.action_space
+    if _quantiles(policy):
+        value = _mean_quantiles(tracer, value, _quantiles(policy))
+    if isinstance(action, spaces.Box):
+        _box(tracer, value, policy, action)
+    elif isinstance(action, spaces.Discrete):
+        tracer.add(Argmax((value,), (1,), (int(action.n),)))
+    elif isinstance(action, spaces.MultiDiscrete) and action.nvec.ndim == 1:
+        sizes = tuple(int(n) for n in action.nvec)
+        tracer.add(Argmax((value,), (len(sizes),), sizes))
+    elif isinstance(action, spaces.MultiBinary):
+        tracer.add(Positive((value,), tracer.shape_of(value)))
+    else:
+        raise UnsupportedError(
+            f"actions in {action} cannot be exported; allowed are Box, Discrete, MultiDiscrete "
+            "(of one axis) and MultiBinary"
+        )
+    shape = action.shape or ()
+    return Graph(space.shape, tuple(tracer.nodes), tuple(shape), images)
+
+
+def check_observations(space: spaces.Space[Any]) -> spaces.Box | spaces.MultiBinary:
+    """The observation space, if its observations are numbers that a policy takes as they are.
+
+    :raises UnsupportedError: if not
+    """
+    if not isinstance(space, (spaces.Box, spaces.MultiBinary)):
+        raise UnsupportedError(
+            f"a policy of observations in {space} cannot be exported; allowed are Box (vectors and "
+            "images) and MultiBinary. Others can be made vectors before training, by gymnasium's "
+            "wrapper FlattenObservation"
+        )
+    return space
+
+
+def check_model(model: BaseAlgorithm) -> None:
+    """Refuse a model that nothing good can come of.
+
+    :raises UnsupportedError: for an algorithm that is not supported
+    :raises CorruptStateError: if a weight is not finite, or is not 0 where its mask has nothing
+    """
+    supported = supported_algorithms()
+    if not isinstance(model, tuple(supported.values())):
+        raise UnsupportedError(
+            f"a model of {type(model).__name__} cannot be exported; supported are "
+            f"{', '.join(supported)}"
+        )
+    policy = model.policy
+    for name, tensor in policy.state_dict().items():
+        if tensor.is_floating_point() and not bool(tensor.isfinite().all()):
+            raise CorruptStateError(
+                f"{name} has values that are not finite, as after a training that diverged; "
+                "export an earlier checkpoint, e.g. best_model.zip"
+            )
+    if not isinstance(policy, SparsePolicyMixin):
+        return
+    for layer in policy.sparse.layers:
+        wrong = int(np.count_nonzero(layer.dense()[~layer.mask()]))
+        if wrong:
+            raise CorruptStateError(
+                f"masks and weights disagree: {wrong} connections of {layer.name} are not 0 though "
+                "its mask has them inactive, as after somebody wrote the weights; "
+                "policy.load_state_dict masks what it loads"
+            )
+
+
+def _modules(policy: Any) -> list[nn.Module]:
+    """What an observation goes through, by kind of policy."""
+    if hasattr(policy, "q_net"):
+        return [policy.q_net.features_extractor, policy.q_net.q_net]
+    if hasattr(policy, "quantile_net"):
+        return [policy.quantile_net.features_extractor, policy.quantile_net.quantile_net]
+    if hasattr(policy, "action_net"):
+        return [
+            policy.pi_features_extractor,
+            policy.mlp_extractor.policy_net,
+            policy.action_net,
+            *([nn.Tanh()] if _squashed(policy.action_dist) else []),
+        ]
+    actor = policy.actor
+    if hasattr(actor, "latent_pi"):
+        return [actor.features_extractor, actor.latent_pi, actor.mu, nn.Tanh()]
+    return [actor.features_extractor, actor.mu]  # TD3 ends in its own tanh
+
+
+def _squashed(distribution: Any) -> bool:
+    """Whether an on-policy actor's distribution squashes its mean."""
+    return (
+        isinstance(distribution, StateDependentNoiseDistribution)
+        and distribution.bijector is not None
+    )
+
+
+def _quantiles(policy: Any) -> int:
+    return int(policy.quantile_net.n_quantiles) if hasattr(policy, "quantile_net") else 0
+
+
+def _mean_quantiles(tracer: Tracer, value: int, quantiles: int) -> int:
+    """QR-DQN acts by the mean over quantiles, which its last layer may as well compute."""
+    last = tracer.nodes[value - 1]
+    if not isinstance(last, Linear):
+        raise UnsupportedError("a quantile network that does not end in a Linear layer")
+    actions = len(last.weight) // quantiles
+    weight = last.weight.astype(np.float64).reshape(quantiles, actions, -1).mean(axis=0)
+    bias = last.bias.astype(np.float64).reshape(quantiles, actions).mean(axis=0)
+    tracer.nodes[value - 1] = Linear(
+        last.inputs, (actions,), weight.astype(np.float32), bias.astype(np.float32)
+    )
+    return value
+
+
+def _box(tracer: Tracer, value: int, policy: Any, space: spaces.Box) -> None:
+    """From the network's output to an action within its bounds, as SB3 has it."""
+    low = space.low.reshape(-1).astype(np.float32)
+    high = space.high.reshape(-1).astype(np.float32)
+    shape = tracer.shape_of(value)
+    if policy.squash_output:
+        scale = (0.5 * (high.astype(np.float64) - low)).astype(np.float32)
+        if (scale != 1).any() or (low != -1).any():
+            tracer.add(Affine((value,), shape, scale, low + scale))
+    else:
+        tracer.add(Clip((value,), shape, low, high))
+
+
+def _scaled(value: int, shape: tuple[int, ...], scale: float, shift: float) -> Affine:
+    units = np.ones(shape[0], np.float32)
+    return Affine((value,), shape, units * np.float32(scale), units * np.float32(shift))
+
+
+def _normalize(tracer: Tracer, normalization: VecNormalize) -> int:
+    """VecNormalize's view of an observation."""
+    rms = normalization.obs_rms
+    assert not isinstance(rms, dict)  # of a space that check_observations refuses
+    shape = tracer.observation_shape
+    scale = 1.0 / np.sqrt(rms.var + normalization.epsilon)
+    return tracer.add(Normalize((0,), shape, rms.mean, scale, float(normalization.clip_obs)))

@@ -1,0 +1,78 @@
+"""Folds scales and shifts into the layers beside them, which changes nothing but rounding."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_sparse.export.graph import Affine, Conv, Graph, Node, Weighted
+
+
+def fold(graph: Graph) -> Graph:
+    """A graph without the :class:`Affine` nodes that a neighbouring layer can do the work of.
+
+    Batch normalisation and the division of pixels by 255 disappear so.
+    """
+    for number, node in enumerate(graph.nodes):
+        if isinstance(node, Affine):
+            changed = _into_producer(graph, number, node) or _into_users(graph, number, node)
+            if changed:
+                return fold(rewrite(graph, {**changed, number: None}))
+    return graph
+
+
+def rewrite(graph: Graph, changed: Mapping[int, Node | None]) -> Graph:
+    """A graph with some nodes replaced, or left out: their input then takes their place.
+
+    :param changed: by number of the node
+    """
+    places = [0]
+    nodes: list[Node] = []
+    for number, node in enumerate(graph.nodes):
+        new = changed.get(number, node)
+        inputs = tuple(places[value] for value in node.inputs)
+        if new is None:
+            places.append(inputs[0])
+            continue
+        nodes.append(replace(new, inputs=inputs))
+        places.append(len(nodes))
+    return replace(graph, nodes=tuple(nodes))
+
+
+def _into_producer(graph: Graph, number: int, node: Affine) -> dict[int, Node]:
+    """Rows of the layer before, if nobody else looks at its result."""
+    (value,) = node.inputs
+    layer = graph.nodes[value - 1] if value else None
+    if not isinstance(layer, Weighted) or len(graph.users(value)) > 1:
+        return {}
+    scale = node.scale.astype(np.float64)
+    weight = layer.weight * scale.reshape(-1, *[1] * (layer.weight.ndim - 1))
+    bias = layer.bias * scale + node.shift
+    return {value - 1: with_weights(layer, weight, bias)}
+
+
+def _into_users(graph: Graph, number: int, node: Affine) -> dict[int, Node]:
+    """Columns of the layers behind, if there is nothing else and no border of zeros in the way."""
+    changed: dict[int, Node] = {}
+    for user, layer in enumerate(graph.nodes):
+        if number + 1 not in layer.inputs:
+            continue
+        bordered = isinstance(layer, Conv) and any(layer.padding) and node.shift.any()
+        if not isinstance(layer, Weighted) or bordered:
+            return {}
+        columns = (1, -1, *[1] * (layer.weight.ndim - 2))
+        weight = layer.weight.astype(np.float64)
+        shifts = (weight * node.shift.reshape(columns)).reshape(len(weight), -1).sum(axis=1)
+        changed[user] = with_weights(
+            layer, weight * node.scale.reshape(columns), layer.bias + shifts
+        )
+    return changed
+
+
+def with_weights(layer: Weighted, weight: NDArray[Any], bias: NDArray[Any]) -> Weighted:
+    """The layer with other weights, in float32."""
+    return replace(layer, weight=weight.astype(np.float32), bias=bias.astype(np.float32))

@@ -1,0 +1,42 @@
+"""In which order the weights of a linear layer are written to C."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_sparse.export.ckernels import GROUP
+
+
+def grouped(rows: NDArray[Any]) -> tuple[list[int], NDArray[Any], NDArray[Any]]:
+    """Lengths, columns and values as the function ``linear`` reads them.
+
+    Rows side by side are padded to the longest with zeros at a column that they have already.
+    """
+    lengths: list[int] = []
+    columns: list[NDArray[Any]] = []
+    values: list[NDArray[Any]] = []
+    together = len(rows) - len(rows) % GROUP
+    for first in [*range(0, together, GROUP), *range(together, len(rows))]:
+        group = rows[first : first + (GROUP if first < together else 1)]
+        active = [np.flatnonzero(row) for row in group]
+        longest = max(map(len, active))
+        lengths.append(longest)
+        column = np.zeros((longest, len(group)), np.int64)
+        value = np.zeros((longest, len(group)), rows.dtype)
+        for lane, (row, found) in enumerate(zip(group, active, strict=True)):
+            column[: len(found), lane] = found
+            column[len(found) :, lane] = found[-1] if found.size else 0
+            value[: len(found), lane] = row[found]
+        columns.append(column.reshape(-1))
+        values.append(value.reshape(-1))
+    return lengths, np.concatenate(columns), np.concatenate(values)
+
+
+def side_by_side(rows: NDArray[Any]) -> NDArray[Any]:
+    """Values of a dense layer as ``linear_dense`` reads them."""
+    together = len(rows) - len(rows) % GROUP
+    groups = [rows[first : first + GROUP].T.reshape(-1) for first in range(0, together, GROUP)]
+    return np.concatenate([*groups, rows[together:].reshape(-1)])

@@ -1,0 +1,46 @@
+"""A policy as one .npz file without pickles, for the loader in ``numpy_policy.py``."""
+
+from __future__ import annotations
+
+import io
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_sparse.export.graph import Graph, Node, Weighted
+
+
+def write_npz(graph: Graph) -> bytes:
+    """Bytes of the file: each node's name, inputs and arrays, as ``<number>.<name>``."""
+    arrays: dict[str, NDArray[Any]] = {
+        "nodes": np.array(len(graph.nodes)),
+        "observation": np.array(graph.observation_shape, np.int64),
+        "action": np.array(graph.action_shape, np.int64),
+    }
+    for number, node in enumerate(graph.nodes):
+        fields = {"op": np.array(node.name), "inputs": np.array(node.inputs), **_fields(node)}
+        arrays.update({f"{number}.{name}": field for name, field in fields.items()})
+    file = io.BytesIO()
+    np.savez(file, **arrays)  # type: ignore[arg-type]
+    return file.getvalue()
+
+
+def _fields(node: Node) -> dict[str, NDArray[Any]]:
+    """A node's arrays, its weight in compressed rows where that is smaller."""
+    fields = node.fields()
+    if not isinstance(node, Weighted):
+        return fields
+    rows = fields.pop("weight")
+    row, column = np.nonzero(rows)
+    index = np.dtype(np.uint16 if rows.shape[1] <= 2**16 else np.uint32)
+    if len(row) * (4 + index.itemsize) >= rows.size * 4:
+        return {**fields, "weight": rows}
+    starts = np.searchsorted(row, np.arange(len(rows) + 1)).astype(np.int32)
+    return {
+        **fields,
+        "data": rows[row, column],
+        "columns": column.astype(index),
+        "starts": starts,
+        "size": np.array(rows.shape),
+    }

@@ -1,0 +1,59 @@
+"""Policy("policy.npz")(observation) is the action; needs NumPy, uses SciPy if it is there."""
+
+import numpy as np
+
+try:
+    from scipy.sparse import csr_array
+except ImportError:  # the same sums by a dense product
+
+    def csr_array(csr, shape):
+        dense = np.zeros(shape, np.float32)
+        dense[np.repeat(np.arange(shape[0]), np.diff(csr[2])), csr[1]] = csr[0]
+        return dense
+
+
+def windows(n, x, border):  # units, kernel, places, batch
+    x = np.pad(x, [(0, 0), *((p, p) for p in n["padding"]), (0, 0)], constant_values=border)
+    x = np.lib.stride_tricks.sliding_window_view(x, tuple(n["kernel"]), (1, 2))
+    return x[:, :: n["stride"][0], :: n["stride"][1]].transpose(0, 4, 5, 1, 2, 3)
+
+
+OPERATIONS = {  # of a node's arrays and its inputs, whose last axis is the batch
+    "normalize": lambda n, x: np.clip((x - n["mean"] - n["rest"]) * n["scale"], *n["clip"]),
+    "affine": lambda n, x: x * n["scale"] + n["shift"],
+    "clip": lambda n, x: np.clip(x, n["low"], n["high"]),
+    "relu": lambda n, x: np.maximum(x, 0),
+    "leaky_relu": lambda n, x: np.where(x > 0, x, x * n["slope"]),
+    "elu": lambda n, x: np.where(x > 0, x, n["slope"] * np.expm1(np.minimum(x, 0))),
+    "tanh": lambda n, x: np.tanh(x),
+    "sigmoid": lambda n, x: 0.5 * np.tanh(0.5 * x) + 0.5,
+    "silu": lambda n, x: x * (0.5 * np.tanh(0.5 * x) + 0.5),
+    "linear": lambda n, x: n["weight"] @ x + n["bias"],
+    "conv": lambda n, x: (
+        n["weight"] @ (w := windows(n, x, 0)).reshape(-1, np.prod(w.shape[3:])) + n["bias"]
+    ).reshape(-1, *w.shape[3:]),
+    "max_pool": lambda n, x: windows(n, x, -np.inf).max((1, 2)),
+    "flatten": lambda n, x: x.reshape(-1, x.shape[-1]),
+    "add": lambda n, x, y: x + y,
+    "argmax": lambda n, x: np.stack([p.argmax(0) for p in np.split(x, n["splits"])]),
+    "positive": lambda n, x: (x > 0).astype(np.int64),
+}
+
+
+class Policy:  # takes one observation, or many: one a row
+    def __init__(self, path):
+        with np.load(path) as file:
+            self.shapes, self.nodes = (file["observation"], file["action"]), []
+            for i in range(file["nodes"]):
+                n = {k.split(".")[1]: file[k] for k in file.files if k.startswith(f"{i}.")}
+                if "data" in n:
+                    n["weight"] = csr_array((n["data"], n["columns"], n["starts"]), n["size"])
+                self.nodes.append(n)
+
+    def __call__(self, observation):
+        x = np.asarray(observation, np.float32)
+        values = [np.moveaxis(x.reshape(-1, *self.shapes[0]), 0, -1)]
+        for n in self.nodes:
+            values.append(OPERATIONS[str(n["op"])](n, *(values[i] for i in n["inputs"])))
+        many = x.shape[: x.ndim - len(self.shapes[0])]
+        return np.moveaxis(values[-1], -1, 0).reshape(*many, *self.shapes[1])

@@ -1,0 +1,157 @@
+"""A policy as an ONNX model."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_sparse.errors import MissingExtra
+from sb3_sparse.export.graph import (
+    Activation,
+    Add,
+    Affine,
+    Argmax,
+    Clip,
+    Conv,
+    Flatten,
+    Graph,
+    Linear,
+    MaxPool,
+    Node,
+    Normalize,
+)
+
+try:
+    from onnx import TensorProto, checker, helper, numpy_helper
+except ImportError as error:
+    raise MissingExtra("exporting to ONNX", "export") from error
+
+OPSET = 17
+IR_VERSION = 8
+ACTIVATIONS = {
+    "relu": "Relu",
+    "leaky_relu": "LeakyRelu",
+    "elu": "Elu",
+    "tanh": "Tanh",
+    "sigmoid": "Sigmoid",
+}
+
+
+def write_onnx(graph: Graph, version: str) -> bytes:
+    """Bytes of a model with one input, ``obs``, and one output, ``action``, both batched.
+
+    Images are uint8, other observations float32; actions are float32, or int64 where they are
+    whole numbers. Weights are dense: ONNX runtimes compute no sparse products.
+
+    :param version: of this package, for the model's producer
+    """
+    writer = _Writer()
+    if graph.images:
+        writer.node("Cast", ["obs"], "value_0", to=TensorProto.FLOAT)
+    for value, node in enumerate(graph.nodes, start=1):
+        inputs = [_name(taken, graph) for taken in node.inputs]
+        writer.write(node, inputs, f"value_{value}")
+    last = f"value_{len(graph.nodes)}"
+    writer.node("Reshape", [last, writer.array([-1, *graph.action_shape], np.int64)], "action")
+    pixels = TensorProto.UINT8 if graph.images else TensorProto.FLOAT
+    numbers = TensorProto.INT64 if graph.discrete else TensorProto.FLOAT
+    made = helper.make_graph(
+        writer.nodes,
+        "policy",
+        [helper.make_tensor_value_info("obs", pixels, ["batch", *graph.observation_shape])],
+        [helper.make_tensor_value_info("action", numbers, ["batch", *graph.action_shape])],
+        writer.arrays,
+    )
+    model = helper.make_model(
+        made,
+        opset_imports=[helper.make_opsetid("", OPSET)],
+        ir_version=IR_VERSION,
+        producer_name="sb3_sparse",
+        producer_version=version,
+    )
+    checker.check_model(model, full_check=True)
+    written: bytes = model.SerializeToString(deterministic=True)
+    return written
+
+
+def _name(value: int, graph: Graph) -> str:
+    return "obs" if value == 0 and not graph.images else f"value_{value}"
+
+
+class _Writer:
+    """Collects nodes and constants."""
+
+    def __init__(self) -> None:
+        self.nodes: list[Any] = []
+        self.arrays: list[Any] = []
+
+    def node(self, kind: str, inputs: list[str], output: str, **attributes: Any) -> str:
+        """Append an ONNX node; the name of its output."""
+        self.nodes.append(helper.make_node(kind, inputs, [output], **attributes))
+        return output
+
+    def array(self, values: Any, kind: type = np.float32) -> str:
+        """Append a constant; its name."""
+        name = f"constant_{len(self.arrays)}"
+        self.arrays.append(numpy_helper.from_array(np.asarray(values, kind), name))
+        return name
+
+    def write(self, node: Node, inputs: list[str], output: str) -> None:
+        """Append what computes a node of the graph."""
+        if isinstance(node, Linear):
+            constants = [self.array(node.weight), self.array(node.bias)]
+            self.node("Gemm", [*inputs, *constants], output, transB=1)
+        elif isinstance(node, Conv):
+            constants = [self.array(node.weight), self.array(node.bias)]
+            sizes = dict(strides=node.stride, pads=[*node.padding, *node.padding])
+            self.node("Conv", [*inputs, *constants], output, **sizes)
+        elif isinstance(node, MaxPool):
+            self.node(
+                "MaxPool",
+                inputs,
+                output,
+                kernel_shape=node.kernel,
+                strides=node.stride,
+                pads=[*node.padding, *node.padding],
+            )
+        elif isinstance(node, Activation) and node.kind == "silu":
+            gate = self.node("Sigmoid", inputs, f"{output}_gate")
+            self.node("Mul", [*inputs, gate], output)
+        elif isinstance(node, Activation):
+            slope = {"alpha": node.slope} if node.kind in ("leaky_relu", "elu") else {}
+            self.node(ACTIVATIONS[node.kind], inputs, output, **slope)
+        elif isinstance(node, Normalize):
+            fields = {name: _batch_first(field) for name, field in node.fields().items()}
+            centred = self.node("Sub", [*inputs, self.array(fields["mean"])], f"{output}_centred")
+            exact = self.node("Sub", [centred, self.array(fields["rest"])], f"{output}_exact")
+            scaled = self.node("Mul", [exact, self.array(fields["scale"])], f"{output}_scaled")
+            bounds = [self.array(-node.clip), self.array(node.clip)]
+            self.node("Clip", [scaled, *bounds], output)
+        elif isinstance(node, (Affine, Clip)):
+            first, second = (_batch_first(field) for field in node.fields().values())
+            kinds = ("Mul", "Add") if isinstance(node, Affine) else ("Max", "Min")
+            half = self.node(kinds[0], [*inputs, self.array(first)], f"{output}_half")
+            self.node(kinds[1], [half, self.array(second)], output)
+        elif isinstance(node, Flatten):
+            self.node("Flatten", inputs, output)
+        elif isinstance(node, Add):
+            self.node("Add", inputs, output)
+        elif isinstance(node, Argmax):
+            self._argmax(node, inputs[0], output)
+        else:
+            positive = self.node("Greater", [*inputs, self.array(0.0)], f"{output}_positive")
+            self.node("Cast", [positive], output, to=TensorProto.INT64)
+
+    def _argmax(self, node: Argmax, scores: str, output: str) -> None:
+        parts = [f"{output}_part_{i}" for i in range(len(node.sizes))]
+        sizes = self.array(node.sizes, np.int64)
+        self.nodes.append(helper.make_node("Split", [scores, sizes], parts, axis=1))
+        best = [self.node("ArgMax", [part], f"{part}_best", axis=1) for part in parts]
+        self.node("Concat", best, output, axis=1)
+
+
+def _batch_first(field: NDArray[Any]) -> NDArray[Any]:
+    """A field of a node, whose last axis is the batch, with the batch first."""
+    return np.moveaxis(field, -1, 0) if field.ndim > 1 else field

@@ -1,0 +1,36 @@
+"""Weights as 8-bit whole numbers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_sparse.export.graph import Floats, Graph, Weighted
+
+LARGEST = 127
+
+
+def quantize_rows(rows: NDArray[Any]) -> tuple[NDArray[np.int8], Floats]:
+    """Nearest whole numbers in [-127, 127] and the scale of each row: ``rows ~ numbers * scale``.
+
+    :param rows: weights, a row for each output
+    """
+    most = np.abs(rows).max(axis=1, initial=0.0)
+    scale = (np.where(most > 0, most, 1.0) / LARGEST).astype(np.float32)
+    return np.rint(rows / scale[:, None]).astype(np.int8), scale
+
+
+def quantized(graph: Graph) -> Graph:
+    """The graph with the weights that 8 bits leave of it."""
+    return replace(graph, nodes=tuple(_rounded(node) for node in graph.nodes))
+
+
+def _rounded(node: Any) -> Any:
+    if not isinstance(node, Weighted):
+        return node
+    numbers, scale = quantize_rows(node.rows)
+    weight = (numbers * scale[:, None]).reshape(node.weight.shape)
+    return replace(node, weight=weight.astype(np.float32))

@@ -1,0 +1,204 @@
+"""A model on disk, and what is known of where it was trained."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+
+import yaml
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.save_util import load_from_zip_file
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_sparse.errors import ConfigError, CorruptStateError
+from sb3_sparse.zoo.experiment import load_for_prediction, saved_settings
+from sb3_sparse.zoo.run import algorithms
+
+VECNORMALIZE = "vecnormalize.pkl"
+BY_POLICY = {
+    "DQNPolicy": "dqn",
+    "QRDQNPolicy": "qrdqn",
+    "SACPolicy": "sac",
+    "TQCPolicy": "tqc",
+    "CrossQPolicy": "crossq",
+    "TD3Policy": "td3",
+}
+"""Of the algorithms that have a policy class to themselves; DDPG is a TD3."""
+
+
+@dataclass(frozen=True)
+class Saved:
+    """A saved model.
+
+    :param path: the zip
+    :param algo: algorithm, e.g. ``"sac"``
+    :param env_id: what it was trained in; None: not known
+    :param params: folder of its run's ``config.yml`` and normalisation; None: it lies in no run
+    :param vecnormalize: statistics that its observations were normalised by; None: they were not
+    """
+
+    path: Path
+    algo: str
+    env_id: str | None = None
+    params: Path | None = None
+    vecnormalize: Path | None = None
+
+    def load(self, env: VecEnv | None = None) -> BaseAlgorithm:
+        """The model; without an environment it is fit for prediction only.
+
+        :param env: to go on training in
+        :raises ConfigError: if the file is of another algorithm, or does not suit ``env``
+        :raises CorruptStateError: if masks and weights in the file disagree
+        """
+        check_masks(self.path)
+        try:
+            if env is None:
+                return load_for_prediction(self.algo, self.path)
+            model: BaseAlgorithm = algorithms()[self.algo].load(self.path, env=env)
+            return model
+        except (KeyError, TypeError, ValueError) as error:
+            raise ConfigError(
+                f"{self.path} cannot be loaded as a model of {self.algo}: {error}"
+            ) from error
+
+
+def find_saved(
+    path: Path,
+    *,
+    best: bool = False,
+    algo: str | None = None,
+    env_id: str | None = None,
+    vecnormalize: Path | None = None,
+) -> Saved:
+    """Find a model and all that belongs to it.
+
+    :param path: a run's folder, of ``sb3-sparse train`` or of ``rl_zoo3.train``, or a zip of SB3,
+        in such a folder or not
+    :param best: of a folder, the best policy instead of the last
+    :param algo: None: as the run's folder or the file says
+    :param env_id: None: as the run's folder says
+    :param vecnormalize: statistics of a VecNormalize; None: those in the run's folder
+    :raises ConfigError: if there is no model, or its statistics are missing
+    """
+    folder = path if path.is_dir() else path.parent
+    arguments = arguments_of(folder) if path.is_dir() or _has_arguments(folder) else {}
+    env_id = env_id or arguments.get("env")
+    params = _params_of(folder, arguments["env"]) if arguments else None
+    if path.is_dir():
+        path = model_in(folder, arguments["env"], best)
+    elif not path.suffix and path.with_suffix(".zip").is_file():
+        path = path.with_suffix(".zip")  # as SB3 does
+    if vecnormalize is None and params is not None and saved_settings(params).get("normalize"):
+        vecnormalize = params / VECNORMALIZE
+        if not vecnormalize.is_file():
+            raise ConfigError(
+                f"the run in {folder} normalised its observations, but {vecnormalize} is missing; "
+                "give the statistics with --vecnormalize FILE"
+            )
+    if vecnormalize is not None and not vecnormalize.is_file():
+        raise ConfigError(
+            f"there is no file {vecnormalize}; give what VecNormalize.save wrote, e.g. "
+            f"{VECNORMALIZE}"
+        )
+    if algo is not None and algo not in algorithms():
+        raise ConfigError(f"unknown algorithm {algo!r}; allowed are {', '.join(algorithms())}")
+    return Saved(path, algo or arguments.get("algo") or algo_of(path), env_id, params, vecnormalize)
+
+
+def algo_of(path: Path) -> str:
+    """The algorithm that a zip was saved by, told by its policy and attributes.
+
+    :raises ConfigError: if it is no model, or of an algorithm that is not supported
+    """
+    data = data_of(path)
+    policy = data.get("policy_class")
+    names = [cls.__name__ for cls in policy.__mro__] if isinstance(policy, type) else []
+    for name, algo in BY_POLICY.items():
+        if name in names:
+            return algo
+    if "ActorCriticPolicy" in names:
+        on_policy = {"clip_range": "ppo", "cg_max_steps": "trpo"}
+        return next((algo for key, algo in on_policy.items() if key in data), "a2c")
+    raise ConfigError(
+        f"{path} has the policy {names[0] if names else policy!r}, which belongs to no supported "
+        f"algorithm; allowed are {', '.join(algorithms())}. If it is one of them, give --algo"
+    )
+
+
+def data_of(path: Path) -> dict[str, Any]:
+    """What SB3 saved beside the weights.
+
+    :raises ConfigError: if there is no such file, or it is no model
+    """
+    if not path.is_file():
+        raise ConfigError(f"there is no file {path}; give a model saved by SB3, e.g. model.zip")
+    try:
+        data, _, _ = load_from_zip_file(path, device="cpu")
+    except (BadZipFile, ValueError) as error:
+        raise ConfigError(f"{path} is no model saved by SB3: {error}") from error
+    if data is None:
+        raise ConfigError(f"{path} is damaged: it has no data in it")
+    return data
+
+
+def check_masks(path: Path) -> None:
+    """Refuse a file with weights where its masks have none, which loading would set to 0.
+
+    :raises CorruptStateError: if so
+    """
+    _, params, _ = load_from_zip_file(path, load_data=False, device="cpu")
+    state: Any = params.get("policy", {})
+    for name, mask in state.items():
+        if name.endswith("_mask") and name.removesuffix("_mask") in state:
+            weight = state[name.removesuffix("_mask")]
+            wrong = int((weight[~mask.bool()] != 0).sum())
+            if wrong:
+                raise CorruptStateError(
+                    f"masks and weights disagree in {path}: {wrong} connections of "
+                    f"{name.removesuffix('.weight_mask')} are not 0 though its mask has them "
+                    "inactive; somebody changed the file. Take an earlier one, or load it with "
+                    "<algorithm>.load, which sets them to 0, and save it again"
+                )
+
+
+def model_in(folder: Path, env_id: str, best: bool) -> Path:
+    """The last or best policy in a run's folder.
+
+    :raises ConfigError: if there is none
+    """
+    path = folder / ("best_model.zip" if best else f"{env_id.replace('/', '-')}.zip")
+    if not path.is_file():
+        models = ", ".join(sorted(file.name for file in folder.glob("*.zip"))) or "none"
+        why = (
+            "there is a best policy after the first evaluation at the sparsity asked for"
+            if best
+            else "a run that was killed has its last policy after sb3-sparse train --resume"
+        )
+        raise ConfigError(f"{folder} has no {path.name} (its models: {models}): {why}")
+    return path
+
+
+def arguments_of(folder: Path) -> dict[str, Any]:
+    """What a run was started with, from the file that rl-zoo writes.
+
+    :raises ConfigError: if there is no run
+    """
+    files = list(folder.glob("*/args.yml"))
+    if len(files) != 1:
+        raise ConfigError(
+            f"there is no run in {folder}; give the run's own folder, e.g. "
+            "logs/sac/HalfCheetah-v5_1"
+        )
+    # rl-zoo writes Python objects into it
+    arguments = yaml.load(files[0].read_text(), Loader=yaml.UnsafeLoader)
+    return dict(arguments)
+
+
+def _has_arguments(folder: Path) -> bool:
+    return len(list(folder.glob("*/args.yml"))) == 1
+
+
+def _params_of(folder: Path, env_id: str) -> Path:
+    return folder / env_id.replace("/", "-")

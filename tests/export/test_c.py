@@ -1,0 +1,198 @@
+"""What the C files hold, and that compilers of all kinds take them."""
+
+import re
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+from export.tools import COMPILER, chain, compiles, random_chain
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support import TinyImages, make
+
+from sb3_sparse.export import export
+from sb3_sparse.export.artifact import OPTIONS, compiled
+from sb3_sparse.export.c import write_c
+from sb3_sparse.export.extract import graph_of
+from sb3_sparse.export.graph import Graph
+from sb3_sparse.export.layout import grouped
+from sb3_sparse.export.memory import plan_memory
+from sb3_sparse.export.quantize import quantize_rows, quantized
+from sb3_sparse.export.units import sort_units
+
+BYTES = {"float": 4, "int8_t": 1, "uint16_t": 2, "uint32_t": 4}
+
+
+def policies():
+    impala = dict(
+        features_extractor_class="sb3_sparse.networks.ImpalaCNN",
+        features_extractor_kwargs=dict(channels=(2, 3, 4), features_dim=16),
+        sparsity=0.5,
+    )
+    return {
+        "vectors": make("SAC"),
+        "dense": make("PPO", policy="MlpPolicy"),
+        "images": make("DQN", TinyImages()),
+        "residual": make("PPO", TinyImages(False), policy_kwargs=impala),
+    }
+
+
+@pytest.fixture(scope="module")
+def models():
+    return policies()
+
+
+KINDS = ["vectors", "dense", "images", "residual"]
+
+
+def works(*options):
+    """Whether the compiler can do without errors what a file for it would need."""
+    code = "#include <math.h>\n#include <stdint.h>\nextern float f;\n"
+    command = [COMPILER, *options, "-x", "c", "-c", "-", "-o", "/dev/null"]
+    return subprocess.run(command, input=code, text=True, capture_output=True).returncode == 0
+
+
+@pytest.mark.parametrize("options", [["-O2"], ["-O3", "-Wconversion"], ["-m32", "-O2"]], ids=str)
+@pytest.mark.parametrize("int8", [False, True])
+@pytest.mark.parametrize("kind", KINDS)
+def test_no_compiler_warns(models, kind, int8, options, tmp_path):
+    if not works(*options):
+        pytest.skip(f"the compiler cannot {options[0]} here (Debian: gcc-multilib)")
+    export(models[kind], tmp_path / "policy", "c", int8=int8)
+    assert compiles(tmp_path / "policy.c", *options) == ""
+
+
+def test_the_vector_code_acts_the_same(models):
+    if not works("-mavx2", "-mfma") or "avx2" not in Path("/proc/cpuinfo").read_text():
+        pytest.skip("no AVX2 here")
+    random = np.random.default_rng(0)
+    graph = sort_units(random_chain(random, [40, 64, 64, 20], 0.2))
+    observations = random.normal(size=(20, 40)).astype(np.float32)
+    source = write_c(graph, "0").source
+    quick = compiled(source, graph, (*OPTIONS, "-mavx2", "-mfma", "-DSB3_SPARSE_AVX2"))
+    np.testing.assert_allclose(quick(observations), graph.run(observations), rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("int8", [False, True])
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_file_states_its_flash_and_ram(models, kind, int8, tmp_path):
+    report = export(models[kind], tmp_path / "policy", "c", int8=int8)
+    source = (tmp_path / "policy.c").read_text()
+    arrays = re.findall(r"static const (\w+) \w+\[(\d+)\] = \{(.*?)\}", source, re.S)
+    assert all(len(numbers.split(",")) == int(size) for _, size, numbers in arrays)
+    flash = sum(BYTES[name] * int(size) for name, size, _ in arrays)
+    ram = 4 * sum(map(int, re.findall(r"^static float memory\[(\d+)\]", source, re.M)))
+    assert report.sizes == {"flash": flash, "RAM": ram}
+    assert f"Flash: {flash} bytes" in source
+    assert f"RAM: {ram} bytes" in source
+    assert "malloc" not in source
+
+
+def test_indices_have_16_bits_where_they_fit_and_32_where_not():
+    weight = np.zeros((1, 70_000), np.float32)
+    weight[0, [1, 69_999]] = [2, 3]
+    wide = chain(70_000, (weight, [0.5]))
+    source = write_c(wide, "0").source
+    assert "uint32_t column_1[2] = {\n    1, 69999\n}" in source
+    observations = np.arange(140_000.0).reshape(2, -1) / 70_000
+    np.testing.assert_allclose(
+        compiled(source, wide)(observations),
+        [[0.5 + 2 * o[1] + 3 * o[69_999]] for o in observations],
+        rtol=1e-6,
+    )
+    narrow = write_c(chain(65_536, (weight[:, :65_536], [0.5])), "0").source
+    assert "uint16_t column_1" in narrow
+    assert "uint32_t column_1" not in narrow
+
+
+def test_a_layer_that_is_nearly_dense_has_no_indices():
+    source = write_c(chain(3, (np.ones((9, 3)), np.zeros(9))), "0").source
+    assert "column_1" not in source
+    assert "value_1[27]" in source
+
+
+def test_rows_side_by_side_are_padded_with_zeros_at_a_column_that_they_have():
+    rows = np.zeros((9, 4))
+    rows[0, 1] = 5
+    rows[7, [0, 2]] = [6, 7]
+    rows[8, 3] = 8
+    lengths, columns, values = grouped(rows)
+    assert lengths == [2, 1]  # of eight rows together, then of the ninth
+    assert columns.tolist() == [1, 0, 0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 2, 3]
+    assert values.tolist() == [5, 0, 0, 0, 0, 0, 0, 6, 0, 0, 0, 0, 0, 0, 0, 7, 8]
+
+
+def test_eight_bits_by_hand():
+    numbers, scale = quantize_rows(
+        np.array([[1.27, -0.5, 0.0], [0.0, 0.0, 0.0], [-254.0, 2.9, 1.0]])
+    )
+    np.testing.assert_allclose(scale, [0.01, 1 / 127, 2.0], rtol=1e-6)
+    assert numbers.tolist() == [[127, -50, 0], [0, 0, 0], [-127, 1, 0]]
+
+
+def test_eight_bit_weights_act_as_the_rounded_weights_do(tmp_path):
+    model = make("SAC", policy_kwargs={"sparsity": 0.5})
+    report = export(model, tmp_path / "policy", "c", int8=True)
+    assert report.parity.difference < 1e-5 < report.rounding.difference < 0.1
+    floats = export(model, tmp_path / "floats", "c")
+    assert report.sizes["flash"] < floats.sizes["flash"]
+    graph = quantized(graph_of(model, None))
+    observations = np.random.default_rng(0).normal(size=(30, 3)).astype(np.float32)
+    np.testing.assert_allclose(
+        compiled((tmp_path / "policy.c").read_text(), graph)(observations),
+        graph.run(observations),
+        atol=1e-5,
+    )
+
+
+@settings(deadline=None, max_examples=40)
+@given(seed=st.integers(0, 10_000), count=st.integers(1, 6))
+def test_no_value_is_overwritten_while_it_is_needed(seed, count):
+    random = np.random.default_rng(seed)
+    sizes = random.integers(1, 20, count + 1).tolist()
+    check_memory(random_chain(random, sizes, 0.5))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_no_value_of_a_policy_is_overwritten_while_it_is_needed(models, kind):
+    check_memory(graph_of(models[kind], None))
+
+
+def check_memory(graph: Graph):
+    """Write a value's number into its place; nobody may have overwritten it when it is read."""
+    memory = plan_memory(graph)
+    floats = np.zeros(memory.size, np.int64)
+    for value, node in enumerate(graph.nodes, start=1):
+        for taken in node.inputs:
+            if taken in memory.places:
+                start = memory.places[taken]
+                assert (floats[start : start + int(np.prod(graph.shape_of(taken)))] == taken).all()
+        if value in memory.places:
+            start = memory.places[value]
+            floats[start : start + int(np.prod(node.shape))] = value
+    assert memory.size <= sum(int(np.prod(node.shape)) for node in graph.nodes) * 2
+
+
+def test_a_main_function_can_step_the_policy(tmp_path):
+    model = make("SAC")
+    export(model, tmp_path / "policy", "c")
+    (tmp_path / "main.c").write_text(
+        """
+        #include <stdio.h>
+        #include "policy.h"
+        int main(void) {
+            float obs[SB3_SPARSE_OBSERVATION_SIZE] = {0.1f, -0.2f, 0.3f};
+            float action[SB3_SPARSE_ACTION_SIZE];
+            sb3_sparse_policy(obs, action);
+            printf("%.9g", (double)action[0]);
+            return 0;
+        }
+        """
+    )
+    program = tmp_path / "main"
+    files = [str(tmp_path / "main.c"), str(tmp_path / "policy.c")]
+    subprocess.run([COMPILER, *OPTIONS, *files, "-lm", "-o", str(program)], check=True)
+    said = subprocess.run([str(program)], capture_output=True, text=True, check=True).stdout
+    expected, _ = model.predict(np.float32([0.1, -0.2, 0.3]), deterministic=True)
+    assert abs(float(said) - expected[0]) < 1e-5

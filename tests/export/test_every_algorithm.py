@@ -1,0 +1,162 @@
+"""Every algorithm and kind of space in every format: the artifact acts as ``predict`` does."""
+
+import numpy as np
+import onnxruntime
+import pytest
+import torch as th
+from export.tools import VECTOR, OwnExtractor, Task
+from gymnasium import spaces
+from support import ALGORITHMS, TinyImages, make
+
+from sb3_sparse.export import FORMATS, export
+from sb3_sparse.export.artifact import compiled
+from sb3_sparse.export.extract import graph_of
+from sb3_sparse.export.numpy_policy import Policy
+
+TWO_AXES = spaces.Box(
+    np.array([[-1, 0.5], [-3, 2]], np.float32), np.array([[1, 0.7], [-2, 9]], np.float32)
+)
+
+
+def trained(algorithm, env=None, **arguments):
+    model = make(algorithm, env, **arguments)
+    model.learn(40)
+    if hasattr(model, "exploration_rate"):
+        favour_no_action(model)
+    return model
+
+
+def favour_no_action(model):
+    """Take what all observations have in common off the scores, or one action is always best."""
+    scores = graph_of(model, None).values(observations_of(model))[-2].mean(axis=1)
+    network = getattr(model, "q_net", None) or model.quantile_net
+    bias = getattr(network, "q_net", None) or network.quantile_net
+    bias[-1].bias.data -= th.as_tensor(np.resize(scores, len(bias[-1].bias)))
+
+
+def observations_of(model, count=50):
+    space = model.observation_space
+    if space.dtype == np.uint8:
+        space.seed(1)
+        return np.stack([space.sample() for _ in range(count)])
+    return np.random.default_rng(1).normal(size=(count, *space.shape)).astype(np.float32)
+
+
+def act(path, to, model, observations):
+    """Actions of what was written, run as a user would."""
+    if to == "c":
+        return compiled(path.with_suffix(".c").read_text(), graph_of(model, None))(observations)
+    if to == "numpy":
+        return Policy(path.with_suffix(".npz"))(observations)
+    if to == "onnx":
+        session = onnxruntime.InferenceSession(path.with_suffix(".onnx"))
+        kind = np.uint8 if observations.dtype == np.uint8 else np.float32
+        return session.run(["action"], {"obs": observations.astype(kind)})[0]
+    loaded = type(model).load(path.with_suffix(".zip"))
+    assert type(loaded.policy).__module__.startswith(("stable_baselines3", "sb3_contrib"))
+    return loaded.predict(observations, deterministic=True)[0]
+
+
+def check(model, folder, to):
+    report = export(model, folder / "policy", to)
+    observations = observations_of(model)
+    expected, _ = model.predict(observations, deterministic=True)
+    found = act(folder / "policy", to, model, observations)
+    if to != "c":
+        assert found.shape == expected.shape
+    apart = np.abs(found.reshape(len(found), -1) - expected.reshape(len(expected), -1))
+    assert apart.max() <= (1e-5 if isinstance(model.action_space, spaces.Box) else 0)
+    assert len(np.unique(expected.reshape(len(expected), -1), axis=0)) > 1  # it does act
+    return report
+
+
+@pytest.mark.parametrize("to", FORMATS)
+@pytest.mark.parametrize("algorithm", ALGORITHMS.values(), ids=ALGORITHMS)
+def test_sparse_policies(algorithm, to, tmp_path):
+    model = trained(algorithm, policy_kwargs={"sparsity": 0.7})
+    report = check(model, tmp_path, to)
+    assert report.parity.holds
+    assert report.parity.random == 1000
+
+
+@pytest.mark.parametrize("to", FORMATS)
+@pytest.mark.parametrize("algorithm", ["DQN", "SAC", "PPO", "TD3", "CrossQ", "QRDQN"])
+def test_stock_policies(algorithm, to, tmp_path):
+    check(trained(algorithm, policy="MlpPolicy"), tmp_path, to)
+
+
+@pytest.mark.parametrize("to", FORMATS)
+@pytest.mark.parametrize(
+    "space",
+    [
+        spaces.MultiDiscrete([3, 2, 4]),
+        spaces.MultiBinary(3),
+        TWO_AXES,
+    ],
+    ids=["MultiDiscrete", "MultiBinary", "2x2"],
+)
+def test_action_spaces(space, to, tmp_path):
+    model = make("PPO", Task(VECTOR, space))
+    model.policy.action_net.weight.data.mul_(100)  # or all actions are the same
+    check(model, tmp_path, to)
+
+
+def test_a_squashed_box_of_two_axes(tmp_path):
+    check(trained("SAC", Task(VECTOR, TWO_AXES)), tmp_path, "c")
+
+
+@pytest.mark.parametrize("to", FORMATS)
+@pytest.mark.parametrize("algorithm", ["DQN", "SAC"])
+def test_images(algorithm, to, tmp_path):
+    model = trained(algorithm, TinyImages(algorithm == "DQN"), policy_kwargs={"sparsity": 0.7})
+    assert check(model, tmp_path, to).parity.random == 100
+
+
+@pytest.mark.parametrize("to", ["c", "numpy", "onnx"])
+def test_the_impala_network_with_its_residual_connections(to, tmp_path):
+    kwargs = dict(
+        features_extractor_class="sb3_sparse.networks.ImpalaCNN",
+        features_extractor_kwargs=dict(channels=(4, 8, 8), features_dim=32),
+        sparsity=0.6,
+    )
+    check(make("PPO", TinyImages(False), policy_kwargs=kwargs), tmp_path, to)
+
+
+@pytest.mark.parametrize("to", FORMATS)
+def test_gsde_of_ppo(to, tmp_path):
+    kwargs = dict(squash_output=True)
+    check(trained("PPO", use_sde=True, policy_kwargs=kwargs), tmp_path, to)
+
+
+def test_gsde_of_sac_with_its_clipped_mean(tmp_path):
+    check(trained("SAC", use_sde=True), tmp_path, "c")
+
+
+@pytest.mark.parametrize("to", ["c", "numpy", "onnx"])
+@pytest.mark.parametrize("activation", ["LeakyReLU", "ELU", "Tanh", "Sigmoid", "SiLU"])
+def test_activations(activation, to, tmp_path):
+    kwargs = dict(activation_fn=f"torch.nn.{activation}", sparsity=0.5)
+    check(make("SAC", policy_kwargs=kwargs), tmp_path, to)
+
+
+@pytest.mark.parametrize("to", ["c", "numpy", "onnx"])
+def test_an_extractor_of_ones_own(to, tmp_path):
+    kwargs = dict(features_extractor_class=OwnExtractor, sparsity=0.5)
+    check(trained("PPO", Task(VECTOR, spaces.Discrete(4)), policy_kwargs=kwargs), tmp_path, to)
+
+
+def test_separate_extractors_of_ppo(tmp_path):
+    kwargs = dict(share_features_extractor=False, features_extractor_class=OwnExtractor)
+    check(trained("PPO", policy_kwargs=kwargs), tmp_path, "c")
+
+
+@pytest.mark.parametrize("to", FORMATS)
+def test_an_actor_without_hidden_layers(to, tmp_path):
+    check(trained("PPO", policy_kwargs=dict(net_arch=[], sparsity=0.2)), tmp_path, to)
+
+
+def test_a_policy_that_computes_on_its_non_zeros(tmp_path):
+    model = trained("SAC", policy_kwargs=dict(compute="sparse"))
+    assert all(layer.compact for layer in model.policy.sparse.layers)
+    check(model, tmp_path, "c")
+    check(model, tmp_path, "dense")

@@ -1,0 +1,250 @@
+"""What is refused, and what is said."""
+
+import pickle
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from export.tools import VECTOR, OddExtractor, Task
+from gymnasium import spaces
+from sb3_contrib import RecurrentPPO
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from support import make
+
+from sb3_sparse.errors import ConfigError, CorruptStateError, UnsupportedError
+from sb3_sparse.export import ParityError, export, record_observations
+from sb3_sparse.export.artifact import compiled
+from sb3_sparse.export.extract import graph_of
+from sb3_sparse.export.parity import compare
+
+
+@pytest.fixture(scope="module")
+def model():
+    return make("SAC")
+
+
+def normalised(**arguments):
+    envs = VecNormalize(DummyVecEnv([lambda: gym.make("Pendulum-v1")]), **arguments)
+    model = make("SAC", envs)
+    model.learn(60)
+    return model
+
+
+def written(folder):
+    return sorted(path.name for path in folder.iterdir())
+
+
+@pytest.mark.parametrize("to", ["c", "numpy", "onnx"])
+def test_normalisation_is_inside(to, tmp_path):
+    model = normalised()
+    report = export(model, tmp_path / "policy", to)
+    assert report.parity.holds
+    if to == "c":
+        act = compiled((tmp_path / "policy.c").read_text(), graph_of(model, None))
+        raw = np.float32([[0.3, -0.9, 4.0], [1, 0, 0]])
+        expected, _ = model.predict(
+            model.get_vec_normalize_env().normalize_obs(raw), None, None, True
+        )
+        np.testing.assert_allclose(act(raw), expected, atol=1e-5)
+
+
+def test_normalisation_far_from_zero_is_as_exact_as_near(tmp_path):
+    model = normalised()
+    rms = model.get_vec_normalize_env().obs_rms
+    rms.mean, rms.var = np.array([1e4, -3e3, 0.1]), np.array([1e-6, 1e-4, 1.0])
+    report = export(model, tmp_path / "policy", "c")
+    assert report.parity.difference < 1e-5
+    assert "mean_1[3] = {\n    10000.0f, -3000.0f, 0.1f" in (tmp_path / "policy.c").read_text()
+
+
+def test_statistics_may_be_given_as_a_file_or_an_object(tmp_path):
+    model = normalised()
+    normalization = model.get_vec_normalize_env()
+    normalization.save(str(tmp_path / "vecnormalize.pkl"))
+    model.env = model._vec_normalize_env = None
+    contents = []
+    for number, given in enumerate([normalization, tmp_path / "vecnormalize.pkl"]):
+        export(model, tmp_path / str(number), "c", vecnormalize=given)
+        contents.append((tmp_path / f"{number}.c").read_bytes())
+    assert contents[0] == contents[1]
+    export(model, tmp_path / "without", "c")
+    assert (tmp_path / "without.c").read_bytes() != contents[0]
+
+
+def test_normalisation_of_rewards_alone_is_none(tmp_path):
+    export(normalised(norm_obs=False), tmp_path / "policy", "c")
+    assert "normalize" not in (tmp_path / "policy.c").read_text()
+
+
+def test_statistics_of_another_environment_are_refused(model, tmp_path):
+    other = VecNormalize(DummyVecEnv([lambda: gym.make("CartPole-v1")]))
+    with pytest.raises(ConfigError, match=r"shape \(4,\), the policy takes shape \(3,\)"):
+        export(model, tmp_path / "policy", "c", vecnormalize=other)
+    (tmp_path / "other.pkl").write_bytes(pickle.dumps([1]))
+    with pytest.raises(ConfigError, match="holds list; give what VecNormalize.save wrote"):
+        export(model, tmp_path / "policy", "c", vecnormalize=tmp_path / "other.pkl")
+    (tmp_path / "other.pkl").write_bytes(b"no pickle")
+    with pytest.raises(ConfigError, match="cannot be read as statistics"):
+        export(model, tmp_path / "policy", "c", vecnormalize=tmp_path / "other.pkl")
+    assert written(tmp_path) == ["other.pkl"]
+
+
+def test_masks_and_weights_that_disagree_are_refused(tmp_path):
+    model = make("SAC")
+    layer = next(iter(model.policy.sparse.layers))
+    flat = layer.weight.data.view(-1)
+    flat[int(np.flatnonzero(~layer.mask())[0])] = 0.5
+    with pytest.raises(CorruptStateError, match=f"disagree: 1 connections of {layer.name}"):
+        export(model, tmp_path / "policy")
+    assert written(tmp_path) == []
+
+
+def test_weights_that_are_not_finite_are_refused(tmp_path):
+    model = make("PPO", policy="MlpPolicy")
+    model.policy.action_net.bias.data[0] = th.nan
+    with pytest.raises(CorruptStateError, match="action_net.bias has values that are not finite"):
+        export(model, tmp_path / "policy")
+
+
+def test_other_algorithms_are_refused(tmp_path):
+    model = RecurrentPPO("MlpLstmPolicy", "CartPole-v1")
+    with pytest.raises(UnsupportedError, match="a model of RecurrentPPO cannot be exported.*SAC"):
+        export(model, tmp_path / "policy")
+
+
+@pytest.mark.parametrize("to", ["c", "numpy", "onnx"])
+def test_observations_that_are_no_numbers_are_refused(to, tmp_path):
+    for env in ("TinyDicts-v0", Task(spaces.Discrete(5), spaces.Discrete(2))):
+        with pytest.raises(UnsupportedError, match="allowed are Box.*FlattenObservation"):
+            export(make("PPO", env), tmp_path / "policy", to)
+
+
+def test_dense_zips_take_every_observation(tmp_path):
+    for number, env in enumerate(["TinyDicts-v0", Task(spaces.Discrete(5), spaces.Discrete(2))]):
+        assert export(make("PPO", env), tmp_path / str(number), "dense").parity.holds
+
+
+def test_networks_that_do_anything_else_are_refused(tmp_path):
+    kwargs = dict(features_extractor_class=OddExtractor)
+    model = make("PPO", Task(VECTOR, spaces.Discrete(2)), policy_kwargs=kwargs)
+    with pytest.raises(UnsupportedError, match=r"OddExtractor .*norm.*allowed are Linear"):
+        export(model, tmp_path / "policy")
+    kwargs = dict(activation_fn="torch.nn.GELU")
+    with pytest.raises(UnsupportedError, match="GELU.*allowed are Linear"):
+        export(make("PPO", policy_kwargs=kwargs), tmp_path / "policy")
+
+
+def test_arguments_are_checked(model, tmp_path):
+    with pytest.raises(ConfigError, match="to must be one of 'c', 'numpy'.*got 'tflite'"):
+        export(model, tmp_path / "policy", "tflite")
+    with pytest.raises(ConfigError, match="int8 is for to='c' only, got to='onnx'"):
+        export(model, tmp_path / "policy", "onnx", int8=True)
+    with pytest.raises(ConfigError, match=r"must end in .onnx, got .*policy.c"):
+        export(model, tmp_path / "policy.c", "onnx")
+    with pytest.raises(ConfigError, match=r"of shape \(3,\).*got an array of shape \(5, 4\)"):
+        export(model, tmp_path / "policy", observations=np.zeros((5, 4)))
+    assert written(tmp_path) == []
+
+
+def test_where_files_go(model, tmp_path):
+    export(model, tmp_path, "c")
+    export(model, str(tmp_path / "new" / "walk.c"), "c")
+    export(model, tmp_path / "new" / "walk", "numpy")
+    assert written(tmp_path) == ["new", "policy.c", "policy.h"]
+    assert written(tmp_path / "new") == ["numpy_policy.py", "walk.c", "walk.h", "walk.npz"]
+
+
+def broken(monkeypatch):
+    """Exports whose last bias is wrong."""
+    from sb3_sparse.export import write
+
+    def wrong(graph):
+        layer = graph.layers[-1]
+        layer.bias[0] += 0.25
+        return graph
+
+    monkeypatch.setattr(write, "remove_dead_units", wrong)
+
+
+@pytest.mark.parametrize("to", ["c", "numpy", "onnx"])
+def test_what_acts_otherwise_is_not_written_unless_forced(model, to, monkeypatch, tmp_path):
+    broken(monkeypatch)
+    with pytest.raises(ParityError, match="does not act as the model: .*difference .*allowed"):
+        export(model, tmp_path / "policy", to)
+    assert written(tmp_path) == []
+    report = export(model, tmp_path / "policy", to, force=True)
+    assert written(tmp_path)
+    assert not report.parity.holds
+    assert "note: written though it does not act as the model" in str(report)
+
+
+def test_a_discrete_action_that_differs_is_told_with_the_gap_of_the_scores(monkeypatch, tmp_path):
+    broken(monkeypatch)
+    model = make("PPO", "CartPole-v1")
+    with pytest.raises(ParityError, match=r"actions differ for \d+ of 1000.*are .* apart in score"):
+        export(model, tmp_path / "policy")
+
+
+def test_parity_by_hand():
+    def model(observations):
+        return np.array([[0.0, 100.0]] * len(observations))
+
+    def other(observations):
+        return model(observations) + [[3e-6, 5e-4]]
+
+    found = compare(model, other, np.zeros((70, 1)), np.zeros((3, 1)), False)
+    assert found.difference == pytest.approx(5e-6)  # 5e-4 of 100
+    assert found.holds
+    assert (found.recorded, found.random) == (70, 3)
+    assert str(found) == "largest difference 5.0e-06 on 70 recorded and 3 random observations"
+    assert not compare(model, lambda o: model(o) + 2e-5, None, np.zeros((3, 1)), False).holds
+    assert not compare(model, lambda o: model(o) * np.nan, None, np.zeros((3, 1)), False).holds
+    found = compare(model, other, None, np.zeros((3, 1)), True)
+    assert found.different == 3
+    assert not found.holds
+
+
+def test_without_a_compiler_a_c_file_is_written_only_when_forced(model, monkeypatch, tmp_path):
+    monkeypatch.setenv("CC", "no-such-compiler")
+    with pytest.raises(UnsupportedError, match="there is no no-such-compiler here; install gcc"):
+        export(model, tmp_path / "policy")
+    assert written(tmp_path) == []
+    report = export(model, tmp_path / "policy", force=True)
+    assert report.parity is None
+    assert "parity: not checked" in str(report)
+    assert "written unchecked, as asked" in str(report)
+    assert written(tmp_path) == ["policy.c", "policy.h"]
+
+
+def test_the_report_counts(tmp_path):
+    model = make("SAC", policy_kwargs=dict(sparsity=0.9))
+    report = export(model, tmp_path / "policy", "c")
+    acting = ("actor.latent", "actor.mu")
+    masks = [la.mask() for la in model.policy.sparse.layers if la.name.startswith(acting)]
+    assert report.nnz == sum(int(mask.sum()) for mask in masks)
+    assert report.dense_bytes == 4 * (3 * 24 + 24 + 24 * 24 + 24 + 24 + 1)
+    assert report.units == 24 + 24 + 1
+    assert 0 < report.removed_units < report.units
+    assert 0 < report.exported_nnz < report.nnz
+    assert report.files[tmp_path / "policy.c"] == (tmp_path / "policy.c").stat().st_size
+    assert f"connections: {report.nnz}, exported {report.exported_nnz}" in str(report)
+
+
+def test_recorded_observations_are_what_the_environment_showed():
+    model = normalised()
+    envs = model.get_env()
+    before = envs.obs_rms.mean.copy()
+    found = record_observations(model, envs, 30)
+    assert found.shape == (30, 3)
+    np.testing.assert_allclose(found[:, 0] ** 2 + found[:, 1] ** 2, 1, rtol=1e-5)  # raw angles
+    np.testing.assert_array_equal(envs.obs_rms.mean, before)
+    assert envs.training
+
+
+def test_recorded_images_are_channels_first(tmp_path):
+    model = make("PPO", "TinyImages-v0")
+    plain = DummyVecEnv([lambda: gym.make("TinyImages-v0")])
+    found = record_observations(model, plain, 5)
+    assert found.shape == (5, 1, 36, 36)
+    assert export(model, tmp_path / "policy", observations=found).parity.recorded == 5
