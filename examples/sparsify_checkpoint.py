@@ -1,4 +1,6 @@
-"""A dense checkpoint of stock SB3 made sparse: its weights, pruned and fine-tuned.
+"""A dense checkpoint of stock SB3 made sparse: its largest weights kept, then fine-tuned.
+
+``sb3-sparse compress dense.zip --env CartPole-v1`` searches for the sparsity as well.
 
 python examples/sparsify_checkpoint.py
 """
@@ -11,7 +13,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 
-from sb3_sparse import SparsePolicy, SparsityCallback
+from sb3_sparse import sparsify
 
 
 def main() -> None:
@@ -19,26 +21,22 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=50_000, help="of each of the two trainings")
     args = parser.parse_args()
     env = make_vec_env("CartPole-v1", n_envs=8, seed=0)
+    evaluation = make_vec_env("CartPole-v1", seed=1)
     settings = dict(n_steps=32, batch_size=256, n_epochs=20, gamma=0.98, gae_lambda=0.8, seed=0)
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "dense.zip"
-        dense = PPO("MlpPolicy", env, **settings)
-        dense.learn(args.steps)
-        dense.save(path)
-        before, _ = evaluate_policy(dense, env, n_eval_episodes=20)
+        PPO("MlpPolicy", env, learning_rate=1e-3, **settings).learn(args.steps).save(path)
+        dense = PPO.load(path, env=env)
 
-        sparse = PPO(
-            SparsePolicy, env, policy_kwargs=dict(sparsity=0.8, initial_sparsity=0.0), **settings
-        )
-        # The dense file has no masks, so it cannot match exactly; its weights and moments do.
-        sparse.set_parameters(path, exact_match=False)
-
-    sparse.learn(args.steps, callback=SparsityCallback("prune", update_interval=100, begin=0.0))
+    sparse = sparsify(dense, {"actor": 0.95, "critic": 0.0})  # the critic is not deployed
+    before, _ = evaluate_policy(dense, evaluation, n_eval_episodes=20)
+    pruned, _ = evaluate_policy(sparse, evaluation, n_eval_episodes=20)
+    sparse.learn(args.steps, reset_num_timesteps=False)
 
     print(sparse.policy.sparsity_report())
-    after, _ = evaluate_policy(sparse, env, n_eval_episodes=20)
-    print(f"return {before:.0f} dense, {after:.0f} sparse")
+    after, _ = evaluate_policy(sparse, evaluation, n_eval_episodes=20)
+    print(f"return {before:.0f} dense, {pruned:.0f} pruned, {after:.0f} fine-tuned")
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ from importlib.metadata import version
 from typing import Any
 
 from sb3_sparse.callback import SparsityCallback
+from sb3_sparse.compress.twin import sparsify
 from sb3_sparse.policies.actor_critic import SparseActorCriticPolicy
 from sb3_sparse.policies.aliases import SparsePolicy, register_policies, supported_algorithms
 from sb3_sparse.policies.dqn import SparseDQNPolicy
@@ -23,6 +24,7 @@ __all__ = [
     "SparseSACPolicy",
     "SparseTD3Policy",
     "SparsityCallback",
+    "sparsify",
     "supported_algorithms",
 ]
 _CONTRIB = ["SparseCrossQPolicy", "SparseQRDQNPolicy", "SparseTQCPolicy"]

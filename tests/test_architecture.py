@@ -41,6 +41,7 @@ EDGES = {
     "rliable": {"report"},
     "onnx": {"export"},
     "onnxruntime": {"export"},
+    "scipy": {"compress", "export"},
     "ray": {"launch"},
     "sqlalchemy": {"tuning"},
     "plotly": {"tuning"},

@@ -15,6 +15,7 @@ BUDGETS = {
     "dqn_set.py": ["--steps", "2000"],
     "run_from_config.py": ["--steps", "2000"],
     "sparsify_checkpoint.py": ["--steps", "2000"],
+    "deploy_c.py": ["--steps", "1500", "--episodes", "2"],
     "tune.py": ["--steps", "2000", "--trials", "2", "--workers", "1"],
 }
 

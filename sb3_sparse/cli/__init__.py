@@ -1,4 +1,4 @@
-"""The command line: ``sb3-sparse train``, ``enjoy``, ``inspect`` and ``tune``."""
+"""The command line, ``sb3-sparse``: one file a command or two."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ try:
     import typer
     from rich.console import Console
 
+    from sb3_sparse.cli.compress import compress
+    from sb3_sparse.cli.export import export
     from sb3_sparse.cli.look import enjoy, inspect
     from sb3_sparse.cli.train import train
     from sb3_sparse.cli.tune import tuning
@@ -27,6 +29,8 @@ app = typer.Typer(
 app.command(context_settings=MORE_VALUES)(train)
 app.command()(enjoy)
 app.command()(inspect)
+app.command()(compress)
+app.command()(export)
 app.add_typer(tuning, name="tune")
 
 

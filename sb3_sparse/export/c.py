@@ -77,10 +77,6 @@ def write_c(graph: Graph, version: str, int8: bool = False) -> CSource:
     includes = "#include <stdint.h>\n"
     if any(name in functions for name in ("tanhf", "expm1f")):
         includes = "#include <math.h>\n" + includes
-    if "SB3_SPARSE_AVX2" in functions:
-        includes += (
-            "#ifdef SB3_SPARSE_AVX2 /* needs -mavx2 -mfma */\n#include <immintrin.h>\n#endif\n"
-        )
     source = (
         f"{comment}{includes}\n{PROTOTYPE};\n\n{memory}{functions}\n{tables}\n\n"
         f"{PROTOTYPE}\n{{\n{body}\n}}\n"
@@ -131,8 +127,7 @@ class _Writer:
             fields["clip"] = np.array(node.clip, np.float32)
             self._elementwise(node, x, y, _size(node), fields)
         elif isinstance(node, Activation):
-            fields = node.fields() if node.kind in ("leaky_relu", "elu") else {}
-            self._elementwise(node, x, y, _size(node), fields)
+            self._elementwise(node, x, y, _size(node), node.fields())
         elif isinstance(node, Add):
             self._elementwise(node, x, y, f"{_size(node)}, {self._place(node.inputs[1])}", {})
         elif isinstance(node, Positive):

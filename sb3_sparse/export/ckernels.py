@@ -16,11 +16,11 @@ static void $name(const float *x, float *y, uint32_t rows, const $index *length,
 {
     uint32_t n;
     for (; rows >= $group; rows -= $group, y += $group, bias += $group$next_scales) {
-$vector$declare
+$declare
         for (n = *length++; n; n--, value += $group, column += $group) {
 $multiply
         }
-$store$vector_end
+$store
     }
     for (; rows; rows--) {
         float a = 0.0f, b = 0.0f;
@@ -34,23 +34,6 @@ $store$vector_end
     }
 }
 """)
-_VECTOR = Template("""\
-#ifdef SB3_SPARSE_AVX2
-        __m256 sum = _mm256_loadu_ps(bias);
-        for (n = *length++; n; n--, value += 8, column += 8)
-            sum = _mm256_fmadd_ps(_mm256_loadu_ps(value), _mm256_i32gather_ps(x, $columns, 4), sum);
-        _mm256_storeu_ps(y, sum);
-#else
-""")
-VECTOR_INCLUDES = """\
-#ifdef SB3_SPARSE_AVX2 /* needs -mavx2 -mfma */
-#include <immintrin.h>
-#endif
-"""
-_COLUMNS = {
-    16: "_mm256_cvtepu16_epi32(_mm_loadu_si128((const __m128i *)column))",
-    32: "_mm256_loadu_si256((const __m256i *)column)",
-}
 _DENSE_LINEAR = Template("""\
 /* y = W x + b. W by columns of $group rows side by side, then by single rows. */
 static void $name(const float *x, float *y, uint32_t rows, uint32_t columns,
@@ -191,7 +174,6 @@ def linear(name: str, bits: int | None, int8: bool) -> str:
     )
     names = ", ".join(f"a{i} = {'0.0f' if int8 else f'bias[{i}]'}" for i in _LANES)
     stored = "bias[{i}] + scale[{i}] * a{i}" if int8 else "a{i}"
-    vector = bits is not None and not int8
     fields = {
         **_types(name, bits, int8),
         "declare": f"        float {names};",
@@ -200,8 +182,6 @@ def linear(name: str, bits: int | None, int8: bool) -> str:
         "value0": _value(0, int8),
         "value1": _value(1, int8),
         "next_scales": f", scale += {GROUP}" if int8 else "",
-        "vector": _VECTOR.substitute(columns=_COLUMNS[bits]) if vector and bits else "",
-        "vector_end": "\n#endif" if vector else "",
     }
     return (_DENSE_LINEAR if bits is None else _LINEAR).substitute(fields)
 

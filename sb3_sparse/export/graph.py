@@ -109,6 +109,8 @@ class Activation(Node):
         return self.kind
 
     def fields(self) -> dict[str, NDArray[Any]]:
+        if self.kind not in ("leaky_relu", "elu"):
+            return {}
         return {"slope": np.array(self.slope, np.float32)}
 
 

@@ -12,15 +12,19 @@ from sb3_sparse.export.graph import Graph, Node, Weighted
 
 
 def write_npz(graph: Graph) -> bytes:
-    """Bytes of the file: each node's name, inputs and arrays, as ``<number>.<name>``."""
+    """Bytes of the file: all nodes' names and inputs, and each one's ``<number>.<array>``."""
+    inputs = np.zeros((len(graph.nodes), 2), np.int32)
+    for row, node in zip(inputs, graph.nodes, strict=True):
+        row[:] = -1  # no input
+        row[: len(node.inputs)] = node.inputs
     arrays: dict[str, NDArray[Any]] = {
-        "nodes": np.array(len(graph.nodes)),
+        "ops": np.array([node.name for node in graph.nodes]),
+        "inputs": inputs,
         "observation": np.array(graph.observation_shape, np.int64),
         "action": np.array(graph.action_shape, np.int64),
     }
     for number, node in enumerate(graph.nodes):
-        fields = {"op": np.array(node.name), "inputs": np.array(node.inputs), **_fields(node)}
-        arrays.update({f"{number}.{name}": field for name, field in fields.items()})
+        arrays.update({f"{number}.{name}": field for name, field in _fields(node).items()})
     file = io.BytesIO()
     np.savez(file, **arrays)  # type: ignore[arg-type]
     return file.getvalue()

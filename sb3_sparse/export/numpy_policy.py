@@ -44,16 +44,16 @@ class Policy:  # takes one observation, or many: one a row
     def __init__(self, path):
         with np.load(path) as file:
             self.shapes, self.nodes = (file["observation"], file["action"]), []
-            for i in range(file["nodes"]):
+            for i, (op, inputs) in enumerate(zip(file["ops"], file["inputs"])):
                 n = {k.split(".")[1]: file[k] for k in file.files if k.startswith(f"{i}.")}
                 if "data" in n:
                     n["weight"] = csr_array((n["data"], n["columns"], n["starts"]), n["size"])
-                self.nodes.append(n)
+                self.nodes.append((OPERATIONS[op], n, inputs[inputs >= 0]))
 
     def __call__(self, observation):
         x = np.asarray(observation, np.float32)
         values = [np.moveaxis(x.reshape(-1, *self.shapes[0]), 0, -1)]
-        for n in self.nodes:
-            values.append(OPERATIONS[str(n["op"])](n, *(values[i] for i in n["inputs"])))
+        for operation, n, inputs in self.nodes:
+            values.append(operation(n, *(values[i] for i in inputs)))
         many = x.shape[: x.ndim - len(self.shapes[0])]
         return np.moveaxis(values[-1], -1, 0).reshape(*many, *self.shapes[1])

@@ -120,7 +120,7 @@ class _Writer:
             gate = self.node("Sigmoid", inputs, f"{output}_gate")
             self.node("Mul", [*inputs, gate], output)
         elif isinstance(node, Activation):
-            slope = {"alpha": node.slope} if node.kind in ("leaky_relu", "elu") else {}
+            slope = {"alpha": node.slope} if node.fields() else {}
             self.node(ACTIVATIONS[node.kind], inputs, output, **slope)
         elif isinstance(node, Normalize):
             fields = {name: _batch_first(field) for name, field in node.fields().items()}

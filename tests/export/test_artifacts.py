@@ -70,7 +70,7 @@ assert not {"torch", "sb3_sparse", "gymnasium"} & set(sys.modules)
     expected, _ = model.predict(seen, deterministic=True)
     np.testing.assert_allclose(many, expected, atol=1e-5)
     np.testing.assert_allclose(one, expected[0], atol=1e-5)
-    np.load(tmp_path / "policy.npz", allow_pickle=False)["0.op"]
+    np.load(tmp_path / "policy.npz", allow_pickle=False)["ops"]
 
 
 TRAIN_ON = """

@@ -2,7 +2,6 @@
 
 import re
 import subprocess
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,7 +18,6 @@ from sb3_sparse.export.graph import Graph
 from sb3_sparse.export.layout import grouped
 from sb3_sparse.export.memory import plan_memory
 from sb3_sparse.export.quantize import quantize_rows, quantized
-from sb3_sparse.export.units import sort_units
 
 BYTES = {"float": 4, "int8_t": 1, "uint16_t": 2, "uint32_t": 4}
 
@@ -61,17 +59,6 @@ def test_no_compiler_warns(models, kind, int8, options, tmp_path):
         pytest.skip(f"the compiler cannot {options[0]} here (Debian: gcc-multilib)")
     export(models[kind], tmp_path / "policy", "c", int8=int8)
     assert compiles(tmp_path / "policy.c", *options) == ""
-
-
-def test_the_vector_code_acts_the_same(models):
-    if not works("-mavx2", "-mfma") or "avx2" not in Path("/proc/cpuinfo").read_text():
-        pytest.skip("no AVX2 here")
-    random = np.random.default_rng(0)
-    graph = sort_units(random_chain(random, [40, 64, 64, 20], 0.2))
-    observations = random.normal(size=(20, 40)).astype(np.float32)
-    source = write_c(graph, "0").source
-    quick = compiled(source, graph, (*OPTIONS, "-mavx2", "-mfma", "-DSB3_SPARSE_AVX2"))
-    np.testing.assert_allclose(quick(observations), graph.run(observations), rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("int8", [False, True])

@@ -1,0 +1,249 @@
+"""How long one action takes, and how many bytes a policy is, in every form that it can be run in.
+
+Actors of SAC with random masks (ERK), at batch 1 on one thread. All variants of a case are timed in
+turn in one process, in short bursts; the medians of bursts and of their ratios are what counts.
+Rows are appended to a CSV file as they come.
+
+    python benchmarks/latency.py                        # every case, about ten minutes
+    python benchmarks/latency.py --sizes 17-256-256-6 --sparsities 95
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import ctypes
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable
+from importlib import util
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+import onnx
+import onnxruntime
+import torch as th
+from gymnasium import spaces
+from stable_baselines3 import SAC
+from step_overhead import RandomEnv
+
+from sb3_sparse import SparsePolicy
+from sb3_sparse.export import export
+from sb3_sparse.export.artifact import compiler
+
+SIZES = ("17-256-256-6", "348-256-256-17", "348-1024-1024-17")
+SPARSITIES = (80, 90, 95, 99)
+OBSERVATIONS = 64
+BURST = 2e-3
+"""Seconds that one burst shall take."""
+PLAIN = ("-std=c99", "-O3")
+NATIVE = (*PLAIN, "-march=native")
+LOOP = """
+#include <stdint.h>
+#include <time.h>
+void sb3_sparse_policy(const float *obs, float *action);
+double seconds(const float *obs, float *action, uint32_t size, uint32_t count)
+{
+    struct timespec start, end;
+    uint32_t i;
+    clock_gettime(CLOCK_MONOTONIC, &start);
+    for (i = 0; i < count; i++)
+        sb3_sparse_policy(obs + (i % OBSERVATIONS) * size, action);
+    clock_gettime(CLOCK_MONOTONIC, &end);
+    return (double)(end.tv_sec - start.tv_sec) + 1e-9 * (double)(end.tv_nsec - start.tv_nsec);
+}
+"""
+KINDS = {"C": PLAIN, "C, -O2": ("-std=c99", "-O2"), "C, -march=native": NATIVE}
+Burst = Callable[[int], float]
+"""Runs that many actions; seconds for all of them."""
+Variants = dict[str, tuple[Burst, int]]
+"""A burst and the bytes of what it runs, by name."""
+
+
+def looped(act: Callable[[Any], Any], observations: list[Any]) -> Burst:
+    """Actions called from Python, one by one."""
+
+    def burst(count: int) -> float:
+        start = time.perf_counter()
+        for i in range(count):
+            act(observations[i % OBSERVATIONS])
+        return time.perf_counter() - start
+
+    return burst
+
+
+def built(source: Path, options: tuple[str, ...], name: str) -> tuple[Any, int]:
+    """A library with the policy and a loop around it; bytes of the policy's code and constants."""
+    folder = source.parent
+    (folder / "loop.c").write_text(LOOP.replace("OBSERVATIONS", f"{OBSERVATIONS}u"))
+    library, code = folder / f"{name}.so", folder / f"{name}.o"
+    cc = compiler()
+    subprocess.run([*cc, *options, "-c", str(source), "-o", str(code)], check=True)
+    loop = [str(folder / "loop.c"), "-D_POSIX_C_SOURCE=199309L"]
+    subprocess.run(
+        [*cc, *options, "-shared", "-fPIC", str(source), *loop, "-o", str(library), "-lm"],
+        check=True,
+    )
+    said = subprocess.run(["size", str(code)], check=True, capture_output=True, text=True).stdout
+    text, data, *_ = said.splitlines()[1].split()
+    return ctypes.CDLL(str(library)), int(text) + int(data)
+
+
+def c_bursts(source: Path, rows: np.ndarray, actions: int, kinds: dict[str, Any]) -> Variants:
+    """A C artifact in a loop of its own, with several options, and called through ctypes."""
+    found: Variants = {}
+    pointer = ctypes.POINTER(ctypes.c_float)
+    action = np.empty(actions, np.float32)
+    where = action.ctypes.data_as(pointer)
+    each = [row.ctypes.data_as(pointer) for row in rows]
+    for number, (name, options) in enumerate(kinds.items()):
+        library, size = built(source, options, f"{source.stem}_{number}")
+        policy, seconds = library.sb3_sparse_policy, library.seconds
+        policy.argtypes, policy.restype = [pointer, pointer], None
+        seconds.restype = ctypes.c_double
+
+        def burst(count: int, seconds: Any = seconds) -> float:
+            return float(seconds(each[0], where, rows.shape[1], count))
+
+        found[name] = (burst, size)
+        if options == PLAIN and source.stem == "sparse":
+            found["C through ctypes"] = (looped(lambda row, f=policy: f(row, where), each), size)
+    return found
+
+
+def session_of(path: Path) -> Any:
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+
+
+def actor(sizes: list[int], sparsity: float) -> SAC:
+    """An untrained actor; biases are drawn, since a trained one has some too."""
+    inputs, *hidden, outputs = sizes
+    space = spaces.Box(-np.inf, np.inf, (inputs,), np.float32)
+    env = RandomEnv(space, spaces.Box(-1, 1, (outputs,), np.float32))
+    sparse = dict(sparsity=sparsity, compute="masked")
+    model = SAC(
+        SparsePolicy if sparsity else "MlpPolicy",
+        env,
+        policy_kwargs=dict(net_arch=hidden, **(sparse if sparsity else {})),
+        buffer_size=1,
+        seed=0,
+        device="cpu",
+    )
+    for name, parameter in model.actor.named_parameters():
+        if name.endswith("bias"):
+            parameter.data.normal_(0, 0.1)
+    return model
+
+
+def empty_session(folder: Path) -> Any:
+    """A graph that does nothing: what a call of onnxruntime costs from Python."""
+    number = onnx.TensorProto.FLOAT
+    ends = [onnx.helper.make_tensor_value_info(name, number, [1, 1]) for name in ("obs", "action")]
+    node = onnx.helper.make_node("Identity", ["obs"], ["action"])
+    graph = onnx.helper.make_graph([node], "empty", ends[:1], ends[1:])
+    opset = onnx.helper.make_opsetid("", 17)
+    onnx.save(onnx.helper.make_model(graph, opset_imports=[opset], ir_version=8), folder / "e.onnx")
+    return session_of(folder / "e.onnx")
+
+
+def variants(sizes: list[int], sparsity: float, folder: Path) -> Variants:
+    """What is timed for one case; the first is what the others are compared to."""
+    sparse, dense = actor(sizes, sparsity), actor(sizes, 0.0)
+    rows = np.random.default_rng(0).normal(size=(OBSERVATIONS, sizes[0])).astype(np.float32)
+    each = list(rows)
+    report = export(sparse, folder / "sparse", "c")
+    export(sparse, folder / "sparse", "numpy")
+    export(sparse, folder / "int8", "c", int8=True)
+    export(dense, folder / "dense", "onnx")
+    weights = report.dense_bytes
+    empty, nothing = empty_session(folder), {"obs": np.zeros((1, 1), np.float32)}
+    session = session_of(folder / "dense.onnx")
+    network = dense.policy.actor
+    network.set_training_mode(False)
+    spec = util.spec_from_file_location("numpy_policy", folder / "numpy_policy.py")
+    assert spec is not None
+    assert spec.loader is not None
+    loader = util.module_from_spec(spec)
+    spec.loader.exec_module(loader)
+    policy = loader.Policy(folder / "sparse.npz")
+
+    def torch_act(row: th.Tensor) -> th.Tensor:
+        with th.no_grad():
+            return th.tanh(network.mu(network.latent_pi(row)))
+
+    return {
+        "onnxruntime, dense": (
+            looped(lambda row: session.run(None, {"obs": row}), [row[None] for row in each]),
+            (folder / "dense.onnx").stat().st_size,
+        ),
+        "onnxruntime, empty graph": (looped(lambda row: empty.run(None, nothing), each), 0),
+        "model.predict, dense": (
+            looped(lambda row: dense.predict(row, deterministic=True), each),
+            weights,
+        ),
+        "torch, dense": (looped(torch_act, [th.as_tensor(row)[None] for row in each]), weights),
+        "numpy": (looped(policy, each), (folder / "sparse.npz").stat().st_size),
+        **c_bursts(folder / "sparse.c", rows, sizes[-1], KINDS),
+        **c_bursts(folder / "int8.c", rows, sizes[-1], {"C, int8": PLAIN}),
+    }
+
+
+def measure(bursts: dict[str, Burst], rounds: int) -> dict[str, list[float]]:
+    """Seconds an action, of each in turn, after a round that finds out how many a burst has."""
+    counts = {}
+    for name, burst in bursts.items():
+        burst(20)
+        counts[name] = max(3, round(BURST / (burst(20) / 20)))
+    times: dict[str, list[float]] = {name: [] for name in bursts}
+    for _ in range(rounds):
+        for name, burst in bursts.items():
+            burst(3)  # what the one before has pushed out of the cache
+            times[name].append(burst(counts[name]) / counts[name])
+    return times
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--sizes", default=",".join(SIZES))
+    parser.add_argument("--sparsities", default=",".join(map(str, SPARSITIES)), help="percent")
+    parser.add_argument("--rounds", type=int, default=61)
+    parser.add_argument("--out", type=Path, default=Path("latency.csv"))
+    args = parser.parse_args()
+    th.set_num_threads(1)
+    with args.out.open("a", newline="") as file:
+        names = ["sizes", "sparsity", "variant", "microseconds", "speedup", "bytes", "smaller"]
+        writer = csv.DictWriter(file, names)
+        if not file.tell():
+            writer.writeheader()
+        for sizes in args.sizes.split(","):
+            for percent in map(int, args.sparsities.split(",")):
+                with tempfile.TemporaryDirectory() as folder:
+                    units = [int(size) for size in sizes.split("-")]
+                    found = variants(units, percent / 100, Path(folder))
+                    bursts = {name: burst for name, (burst, _) in found.items()}
+                    times = measure(bursts, args.rounds)
+                base = next(iter(times.values()))
+                weights = found["torch, dense"][1]
+                for name, seconds in times.items():
+                    ratios = [a / b for a, b in zip(base, seconds, strict=True)]
+                    row = {
+                        "sizes": sizes,
+                        "sparsity": percent,
+                        "variant": name,
+                        "microseconds": f"{1e6 * median(seconds):.3g}",
+                        "speedup": f"{median(ratios):.3g}",
+                        "bytes": found[name][1] or "",
+                        "smaller": f"{weights / found[name][1]:.3g}" if found[name][1] else "",
+                    }
+                    writer.writerow(row)
+                    print(*(f"{value!s:<16}" for value in row.values()), flush=True)
+                file.flush()
+
+
+if __name__ == "__main__":
+    main()

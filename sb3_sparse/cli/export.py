@@ -1,0 +1,68 @@
+"""``sb3-sparse export``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from sb3_sparse.cli.common import console, text
+from sb3_sparse.errors import ConfigError
+
+RECORDED = 1000
+RECORDING_ENVS = 10
+
+
+def export(
+    model: Annotated[Path, typer.Argument(help="A run's folder, or a zip saved by SB3.")],
+    out: Annotated[
+        Path, typer.Argument(help="The file to write; its suffix may be left out.")
+    ] = Path("policy"),
+    to: Annotated[str, text("c, numpy, onnx or dense (a zip of stock SB3).", "--to")] = "c",
+    vecnormalize: Annotated[
+        Path | None,
+        text("Statistics that VecNormalize saved.", shown="those in the run's folder"),
+    ] = None,
+    int8: Annotated[
+        bool, text("C only: weights as 8-bit numbers with a scale for each row.", "--int8")
+    ] = False,
+    best: Annotated[bool, text("The best policy instead of the last.", "--best")] = False,
+    env: Annotated[
+        str | None,
+        text("Environment to record observations in.", shown="the one of the run"),
+    ] = None,
+    algo: Annotated[str | None, text("Algorithm.", shown="told from the file")] = None,
+    force: Annotated[bool, text("Write also what does not act as the model.", "--force")] = False,
+) -> None:
+    """Write a policy as C, NumPy or ONNX, or as a dense zip, and check that it acts the same."""
+    from sb3_sparse.export import FORMATS, record_observations
+    from sb3_sparse.export import export as write
+    from sb3_sparse.zoo.finetune import evaluation_envs
+    from sb3_sparse.zoo.saved import find_saved
+
+    if to not in FORMATS:
+        raise ConfigError(f"--to must be one of {', '.join(FORMATS)}, got {to!r}")
+    saved = find_saved(model, best=best, algo=algo, env_id=env, vecnormalize=vecnormalize)
+    loaded = saved.load()
+    observations = None
+    if saved.env_id is not None:
+        envs = evaluation_envs(saved, RECORDING_ENVS, 0)
+        try:
+            observations = record_observations(loaded, envs, RECORDED)
+        finally:
+            envs.close()
+    report = write(
+        loaded,
+        out,
+        to,
+        vecnormalize=saved.vecnormalize,
+        observations=observations,
+        int8=int8,
+        force=force,
+    )
+    console.print(str(report), soft_wrap=True)
+    if observations is None:
+        console.print(
+            "note: no observations were recorded; --env ID compares them on an environment's, too"
+        )

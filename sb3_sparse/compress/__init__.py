@@ -1,0 +1,9 @@
+"""Trained models made sparse: their twins, and the search for how sparse they can be."""
+
+from __future__ import annotations
+
+from sb3_sparse.compress.result import Compression
+from sb3_sparse.compress.run import compress
+from sb3_sparse.compress.twin import sparsify
+
+__all__ = ["Compression", "compress", "sparsify"]

@@ -1,0 +1,185 @@
+"""Models, environments and files that a search works with."""
+
+from __future__ import annotations
+
+import copy
+import shutil
+from pathlib import Path
+from typing import Any
+
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
+
+from sb3_sparse.compress.evaluation import episode_returns
+from sb3_sparse.compress.finetune import fill_buffer, fine_tune
+from sb3_sparse.compress.twin import load_beside, sparse_policy, sparsify, sparsity_of
+from sb3_sparse.engine.network import SparseNetwork
+from sb3_sparse.errors import CorruptStateError
+
+LEVELS = "levels"
+VECNORMALIZE = "vecnormalize.pkl"
+SEEDS_PER_BATCH = 1000
+"""More than there are environments, each of which gets a seed of its own."""
+NORMALIZATION = ("obs_rms", "ret_rms")
+WHEREABOUTS = ("_last_obs", "_last_original_obs", "_last_episode_starts")
+"""Where a model is in its environment."""
+
+
+class Bench:
+    """Prunes, trains and evaluates for a search.
+
+    :param model: the model to be compressed, with an environment; it is not changed, but its
+        environment and replay buffer are used
+    :param eval_env: environments of the evaluation
+    :param folder: where accepted models are kept
+    :param steps: environment steps of a fine-tuning
+    :param episodes: of a batch
+    :param seed: of all
+    :param deterministic: whether policies are evaluated deterministically
+    :param distribution: how sparsity is shared out; None: as the model has it
+    """
+
+    def __init__(
+        self,
+        model: BaseAlgorithm,
+        eval_env: VecEnv,
+        folder: Path,
+        steps: int,
+        episodes: int,
+        seed: int,
+        deterministic: bool,
+        distribution: str | None,
+    ) -> None:
+        self.model = model
+        self.eval_env = eval_env
+        self.folder = folder
+        self.steps = steps
+        self.episodes = episodes
+        self.seed = seed
+        self.deterministic = deterministic
+        self.sparsities = sparsity_of(model)
+        self.network = "actor" if "actor" in self.sparsities else next(iter(self.sparsities))
+        self.accepted = sparsify(model, self.sparsities, distribution=distribution)
+        self.candidate = self.accepted
+        self._played_last = model
+        self._before = self._statistics()
+        """Normalisation of the model to be compressed."""
+        self._kept = self._before
+        """The same of the accepted model."""
+
+    @property
+    def nnz(self) -> int:
+        """Connections of the accepted model's acting network."""
+        return self._acting(self.accepted).nnz
+
+    @property
+    def floor(self) -> float:
+        """Density at which every layer has one connection."""
+        network = self._acting(self.accepted)
+        return len(network.layers) / network.size
+
+    def restore(self, number: int) -> None:
+        """Go on from the accepted model of a level.
+
+        :raises CorruptStateError: if its file is gone
+        """
+        path = self._path(number)
+        if not path.is_file():
+            raise CorruptStateError(f"{path} is missing; remove {self.folder} and begin anew")
+        self.candidate = self.accepted = load_beside(self.model, path)
+        normalize = self.model.get_vec_normalize_env()
+        if normalize is not None:
+            saved = VecNormalize.load(str(path.with_suffix(".pkl")), normalize.venv)
+            self._kept = {name: getattr(saved, name) for name in NORMALIZATION}
+
+    def make(self, number: int, sparsity: float) -> int:
+        """Prune the last accepted model and fine-tune it; connections of its acting network."""
+        self._set_statistics(self.model.env, self._kept)
+        if isinstance(self.accepted, OffPolicyAlgorithm):
+            # The environment goes on where the last model left it, as the replay buffer expects.
+            for name in WHEREABOUTS:
+                setattr(self.accepted, name, copy.deepcopy(getattr(self._played_last, name)))
+            self.accepted.set_random_seed(self.seed)
+            fill_buffer(self.accepted)
+        model = sparsify(self.accepted, {**self.sparsities, self.network: sparsity})
+        model.set_random_seed(self.seed + number)
+        if isinstance(model, OnPolicyAlgorithm):
+            model._last_obs = None  # a level begins alike, whatever was before
+        self._played_last = self.candidate = model
+        fine_tune(model, self.steps)
+        return self._acting(model).nnz
+
+    def returns(self, baseline: bool, batch: int) -> list[float]:
+        """Returns of a numbered batch of episodes, of the baseline or the candidate."""
+        statistics = self._before if baseline else self._statistics()
+        self._set_statistics(self.eval_env, statistics)
+        return episode_returns(
+            self.model if baseline else self.candidate,
+            self.eval_env,
+            self.episodes,
+            self.seed + SEEDS_PER_BATCH * (batch + 1),
+            self.deterministic,
+        )
+
+    def accept(self, number: int) -> None:
+        """Keep the candidate, and put it on the disk."""
+        self.accepted, self._kept = self.candidate, self._statistics()
+        path = self._path(number)
+        path.parent.mkdir(exist_ok=True)
+        self._save(path, path.with_suffix(".pkl"))
+
+    def back_to_accepted(self) -> None:
+        """Make the accepted model the candidate again, with its normalisation."""
+        self.candidate = self.accepted
+        self._set_statistics(self.model.env, self._kept)
+
+    def forget_levels(self, kept: int) -> None:
+        """Remove the files of every level but one.
+
+        :param kept: its number; 0: none
+        """
+        for path in (self.folder / LEVELS).glob("*"):
+            if path.stem != str(kept):
+                path.unlink()
+
+    def finish(self, name: str) -> Path:
+        """Write the accepted model as rl-zoo lays out a run; its file."""
+        self.back_to_accepted()
+        (self.folder / name).mkdir(exist_ok=True)
+        path = self.folder / f"{name}.zip"
+        self._save(path, self.folder / name / VECNORMALIZE)
+        return path
+
+    def clear(self) -> None:
+        """Remove what only an interrupted search needs."""
+        shutil.rmtree(self.folder / LEVELS, ignore_errors=True)
+
+    def _save(self, path: Path, normalization: Path) -> None:
+        normalize = self.model.get_vec_normalize_env()
+        if normalize is not None:
+            normalize.save(str(normalization))
+        new = path.with_suffix(".new")
+        with new.open("wb") as file:
+            self.candidate.save(file)
+        new.replace(path)
+
+    def _acting(self, model: BaseAlgorithm) -> SparseNetwork:
+        networks = sparse_policy(model).sparse.networks
+        return next(network for network in networks if network.name == self.network)
+
+    def _path(self, number: int) -> Path:
+        return self.folder / LEVELS / f"{number}.zip"
+
+    def _statistics(self) -> dict[str, Any]:
+        normalize = self.model.get_vec_normalize_env()
+        if normalize is None:
+            return {}
+        return {name: copy.deepcopy(getattr(normalize, name)) for name in NORMALIZATION}
+
+    @staticmethod
+    def _set_statistics(env: VecEnv | None, statistics: dict[str, Any]) -> None:
+        normalize = None if env is None else unwrap_vec_normalize(env)
+        if normalize is not None:
+            vars(normalize).update(copy.deepcopy(statistics))

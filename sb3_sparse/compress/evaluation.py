@@ -1,0 +1,71 @@
+"""Episodes that can be paired: the same number, the same seed."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.atari_wrappers import EpisodicLifeEnv
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+
+from sb3_sparse.errors import ConfigError
+
+
+def check_eval_env(env: VecEnv) -> None:
+    """Refuse environments whose returns would not be the model's.
+
+    :raises ConfigError: if their normalisation learns or scales rewards, or if several would not
+        really start anew when they are reset
+    """
+    normalize = unwrap_vec_normalize(env)
+    if normalize is not None and (normalize.training or normalize.norm_reward):
+        raise ConfigError(
+            "the evaluation environment normalises rewards or learns its statistics; set "
+            "eval_env.training = False and eval_env.norm_reward = False"
+        )
+    if env.num_envs > 1 and any(env.env_is_wrapped(EpisodicLifeEnv)):
+        raise ConfigError(
+            f"{env.num_envs} evaluation environments end an episode with each life and cannot be "
+            "reset in the middle of a game; give one environment, or terminal_on_life_loss=False"
+        )
+
+
+def episode_returns(
+    model: BaseAlgorithm, env: VecEnv, episodes: int, seed: int, deterministic: bool
+) -> list[float]:
+    """Undiscounted returns of episodes, as many in each environment, so that none is favoured.
+
+    As in SB3, those of a Monitor count where there is one. torch's generator is left where it was.
+
+    :param episodes: at least so many; rounded up to a multiple of the number of environments
+    :param seed: of the environments, and of actions that are drawn
+    :param deterministic: whether the policy acts deterministically
+    """
+    rounds = math.ceil(episodes / env.num_envs)
+    monitored = all(env.env_is_wrapped(Monitor))
+    returns = np.zeros((rounds, env.num_envs))
+    played = np.zeros(env.num_envs, dtype=np.int64)
+    running = np.zeros(env.num_envs)
+    devices = [model.device] if model.device.type == "cuda" else []
+    with th.random.fork_rng(devices=devices):
+        th.manual_seed(seed)
+        env.seed(seed)
+        observation = env.reset()
+        while (played < rounds).any():
+            actions, _ = model.predict(observation, deterministic=deterministic)  # type: ignore[arg-type]
+            observation, rewards, dones, infos = env.step(actions)
+            running += rewards
+            for index in np.flatnonzero(dones):
+                episode = infos[index].get("episode") if monitored else None
+                if monitored and episode is None:
+                    continue  # a life was lost, and the game goes on
+                if played[index] < rounds:
+                    total = running[index] if episode is None else episode["r"]
+                    returns[played[index], index] = total
+                played[index] += 1
+                running[index] = 0.0
+    found: list[float] = returns.ravel().tolist()
+    return found

@@ -1,0 +1,101 @@
+"""The statistics of the guard: what returns show about a drop."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from sb3_sparse.errors import ConfigError, MissingExtra
+
+CONFIDENCE = 0.95
+Verdict = Literal["passed", "failed", "undecided"]
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A mean and its 95 % confidence interval.
+
+    :param mean: the estimate
+    :param low: lower end
+    :param high: upper end
+    """
+
+    mean: float
+    low: float
+    high: float
+
+    def __str__(self) -> str:
+        return f"{self.mean:.2f} [{self.low:.2f}, {self.high:.2f}]"
+
+    def share_of(self, whole: float) -> str:
+        """The interval as signed percentages of ``|whole|``."""
+        if whole == 0.0:
+            return "of a return of 0"
+        mean, low, high = (100 * value / abs(whole) for value in (self.mean, self.low, self.high))
+        return f"{mean:+.2f} % [{low:+.2f} %, {high:+.2f} %]"
+
+
+def mean_interval(values: Sequence[float]) -> Interval:
+    """Student's t interval of a mean; of identical values, the value itself.
+
+    :param values: two or more
+    """
+    array = np.asarray(values, dtype=np.float64)
+    assert array.size >= 2
+    mean = float(array.mean())
+    error = float(array.std(ddof=1)) / np.sqrt(array.size)
+    half = _t_quantile(array.size - 1) * error
+    return Interval(mean, float(mean - half), float(mean + half))
+
+
+def change(sparse: Sequence[float], baseline: Sequence[float]) -> Interval:
+    """By how much the mean return has changed, from pairs of episodes.
+
+    Episodes of the same number begin with the same seed, so much of their luck is the same; the
+    interval of the paired differences is then narrower than Welch's of two independent samples. If
+    nothing is shared, it costs degrees of freedom only.
+
+    :param sparse: returns of the sparse model
+    :param baseline: returns of the model that it is compared with, in the same order
+    """
+    assert len(sparse) == len(baseline)
+    return mean_interval(np.subtract(sparse, baseline).tolist())
+
+
+def judge(change: Interval, tolerance: float) -> Verdict:
+    """Whether a drop is shown to be tolerable (passed), shown not to be (failed), or neither.
+
+    :param change: change of the mean return
+    :param tolerance: largest drop allowed, in units of the return, 0 or more
+    """
+    if change.low >= -tolerance:
+        return "passed"
+    return "failed" if change.high < -tolerance else "undecided"
+
+
+def tolerance(baseline: Sequence[float], max_drop: float) -> float:
+    """The largest drop allowed, in units of the return.
+
+    :param baseline: returns of the model to be compressed
+    :param max_drop: share of the absolute mean return
+    :raises ConfigError: if the mean cannot be told from 0, of which a share means nothing
+    """
+    interval = mean_interval(baseline)
+    if interval.low <= 0.0 <= interval.high:
+        raise ConfigError(
+            f"the model's return is {interval} over {len(baseline)} episodes, which cannot be told "
+            f"from 0, so a drop by {max_drop:.2%} of it means nothing; give a fixed sparsity "
+            "instead of a largest drop, or evaluate more episodes"
+        )
+    return max_drop * abs(interval.mean)
+
+
+def _t_quantile(freedom: int) -> float:
+    try:
+        from scipy.special import stdtrit
+    except ImportError as error:
+        raise MissingExtra("compressing a model", "zoo") from error
+    return float(stdtrit(freedom, 0.5 + CONFIDENCE / 2))

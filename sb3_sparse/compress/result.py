@@ -1,0 +1,50 @@
+"""What a compression came to."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from sb3_sparse.compress.guard import Interval
+from sb3_sparse.compress.search import Level
+
+
+@dataclass(frozen=True)
+class Compression:
+    """The outcome. Its returns are of episodes that had no part in choosing it.
+
+    :param path: the model
+    :param network: the network that acts, which was pruned
+    :param sparsity: of every network
+    :param nnz_before: active connections of the acting network, before
+    :param nnz: the same now
+    :param baseline: return of the model that was compressed
+    :param outcome: return of the compressed one
+    :param change: of the return, from pairs of episodes
+    :param episodes: how many each played
+    :param levels: what was tried
+    """
+
+    path: Path
+    network: str
+    sparsity: Mapping[str, float]
+    nnz_before: int
+    nnz: int
+    baseline: Interval
+    outcome: Interval
+    change: Interval
+    episodes: int
+    levels: tuple[Level, ...]
+
+    def __str__(self) -> str:
+        networks = ", ".join(f"{name} {value:.2%}" for name, value in self.sparsity.items())
+        return "\n".join(
+            [
+                f"sparsity: {networks}",
+                f"connections of the {self.network}: {self.nnz_before:,} before, {self.nnz:,} now",
+                f"return: {self.baseline} before, {self.outcome} now, over {self.episodes} fresh "
+                "episodes each, 95 % intervals",
+                f"change: {self.change.share_of(self.baseline.mean)}",
+            ]
+        )

@@ -1,0 +1,105 @@
+"""``compress.json``: what a compression was asked for and how far it is."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from sb3_sparse.compress.guard import Interval
+from sb3_sparse.compress.search import Level
+from sb3_sparse.errors import ConfigError, CorruptStateError
+
+NAME = "compress.json"
+FORMAT = 1
+
+
+@dataclass
+class State:
+    """All that an interrupted compression goes on from, beside the accepted model.
+
+    :param settings: what decides about the outcome, in plain JSON types
+    :param baseline: returns of the model to be compressed, by batch
+    :param levels: done so far
+    :param checked: returns of the outcome and of the baseline, of episodes that decided nothing
+    :param finished: whether the outcome is written
+    """
+
+    settings: dict[str, Any]
+    baseline: dict[int, list[float]] = field(default_factory=dict)
+    levels: list[Level] = field(default_factory=list)
+    checked: tuple[list[float], list[float]] | None = None
+    finished: bool = False
+
+    @property
+    def accepted(self) -> int:
+        """Number of the last level whose model was accepted, from 1; 0: none was."""
+        return max((n for n, level in enumerate(self.levels, 1) if level.accepted), default=0)
+
+    def save(self, folder: Path) -> None:
+        """Write the file, whole or not at all."""
+        new = folder / f"{NAME}.new"
+        new.write_text(json.dumps({"format": FORMAT, **asdict(self)}, indent=1) + "\n")
+        new.replace(folder / NAME)
+
+
+def open_state(folder: Path, settings: dict[str, Any]) -> State:
+    """The state in a folder, or a new one.
+
+    :raises ConfigError: if the folder's compression is of other settings
+    :raises CorruptStateError: if its file is damaged
+    """
+    path = folder / NAME
+    if not path.is_file():
+        return State(settings)
+    try:
+        content = json.loads(path.read_text())
+        state = State(
+            settings=content["settings"],
+            baseline={int(batch): found for batch, found in content["baseline"].items()},
+            levels=[_level(level) for level in content["levels"]],
+            checked=content["checked"],
+            finished=content["finished"],
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise CorruptStateError(
+            f"{path} is damaged ({type(error).__name__}: {error}); remove the folder and begin anew"
+        ) from error
+    others = {
+        name: (state.settings.get(name), settings.get(name))
+        for name in {**state.settings, **settings}
+        if state.settings.get(name) != settings.get(name)
+    }
+    if others:
+        told = ", ".join(
+            f"{name} {old!r} instead of {new!r}" for name, (old, new) in others.items()
+        )
+        raise ConfigError(
+            f"{folder} holds a compression with {told}. Give the same settings to go on with it, "
+            "or another folder"
+        )
+    return state
+
+
+def _level(content: Mapping[str, Any]) -> Level:
+    return Level(
+        **{
+            **content,
+            "returns": tuple(content["returns"]),
+            "change": Interval(**content["change"]),
+        }
+    )
+
+
+def fingerprint(model: BaseAlgorithm) -> str:
+    """A hash of a model's policy and step count."""
+    digest = hashlib.sha256(f"{type(model).__name__} {model.num_timesteps}".encode())
+    for name, tensor in sorted(model.policy.state_dict().items()):
+        digest.update(name.encode())
+        digest.update(tensor.detach().cpu().numpy().tobytes())
+    return digest.hexdigest()[:16]

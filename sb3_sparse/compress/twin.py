@@ -1,0 +1,209 @@
+"""The sparse twin of a trained model."""
+
+from __future__ import annotations
+
+import copy
+import io
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import torch as th
+from numpy.typing import NDArray
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.save_util import load_from_zip_file, save_to_zip_file
+
+from sb3_sparse.engine.masked import MaskedLayer
+from sb3_sparse.errors import ConfigError, UnsupportedError
+from sb3_sparse.policies.aliases import supported_algorithms
+from sb3_sparse.policies.mixin import SparsePolicyMixin
+from sb3_sparse.sparsity.selection import largest
+
+Algorithm = TypeVar("Algorithm", bound=BaseAlgorithm)
+State = dict[str, th.Tensor]
+
+MASK = ".weight_mask"
+
+
+def sparsify(
+    model: Algorithm,
+    sparsity: float | Mapping[str, float],
+    *,
+    distribution: str | None = None,
+    dense_layers: Sequence[str] | None = None,
+    compute: str | None = None,
+) -> Algorithm:
+    """A sparse twin of a trained model, dense or sparse already; the model stays as it is.
+
+    Every layer keeps the connections of largest ``|weight|`` and their weights, and the twin acts
+    as the model with all others set to 0. It is of the same algorithm and hyperparameters, has the
+    same step count and optimizer states (0 where a connection is gone), and goes on training where
+    the model would. Environment and replay buffer are not copied but taken over, so train one of
+    the two. As ``load`` does, it seeds the generators if the model has a ``seed``.
+
+    A model that is sparse already can only lose connections.
+
+    :param model: a model of a supported algorithm, with one of SB3's own policies or a sparse one
+    :param sparsity: removed fraction of the kernels' connections, in [0, 1), or one for each
+        network, e.g. ``{"actor": 0.9, "critic": 0.0}``
+    :param distribution: ``"erk"``, ``"er"`` or ``"uniform"``; None: a sparse model's own, else
+        ``"erk"``
+    :param dense_layers: layers left dense; None: a sparse model's own, else none
+    :param compute: as of :class:`~sb3_sparse.policies.mixin.SparsePolicyMixin`; None: a sparse
+        model's own, else ``"auto"``
+    :raises ConfigError: for a value that is not allowed, or if a layer would need more connections
+        than it has
+    :raises UnsupportedError: for another algorithm or a policy class that has no sparse counterpart
+
+    Source: magnitude pruning, arXiv:1506.02626; shared out by layer as arXiv:1911.11134, section 3.
+    """
+    policy_class = _sparse_class(model)
+    file = io.BytesIO()
+    model.save(file)
+    file.seek(0)
+    data, loaded, variables = load_from_zip_file(file, device="cpu")
+    assert data is not None
+    params: dict[str, Any] = dict(loaded)
+    given = {"distribution": distribution, "dense_layers": dense_layers, "compute": compute}
+    data["policy_class"] = policy_class
+    data["policy_kwargs"] = {
+        "mask_seed": model.seed or 0,  # not drawn, so that nothing of the twin hangs on luck
+        **data["policy_kwargs"],
+        "sparsity": dict(sparsity) if isinstance(sparsity, Mapping) else sparsity,
+        "initial_sparsity": None,
+        "actor_share": None,
+        **{key: value for key, value in given.items() if value is not None},
+    }
+    params["policy"] = _pruned(model, data, params["policy"])
+    twin_file = io.BytesIO()
+    save_to_zip_file(twin_file, data=data, params=params, pytorch_variables=variables)
+    twin_file.seek(0)
+    twin = load_beside(model, twin_file, force_reset=False)
+    if model._custom_logger:
+        twin.set_logger(model.logger)
+    policy = sparse_policy(twin)
+    for layer in policy.sparse.layers:
+        layer.settle_moments(policy.sparse.optimizers)
+    return twin
+
+
+def load_beside(
+    model: Algorithm, file: io.BufferedIOBase | Path, force_reset: bool = True
+) -> Algorithm:
+    """A saved model that works with the environment and replay buffer of another.
+
+    :param force_reset: whether it begins with a reset of the environment
+    """
+    own: dict[str, Any] = {}
+    if isinstance(model, OffPolicyAlgorithm):
+        own["replay_buffer"] = model.replay_buffer
+    return type(model).load(
+        file, env=model.env, device=model.device, force_reset=force_reset, **own
+    )
+
+
+def sparse_policy(model: BaseAlgorithm) -> SparsePolicyMixin:
+    """The policy of a model that is known to be sparse."""
+    assert isinstance(model.policy, SparsePolicyMixin)
+    return model.policy
+
+
+def sparsity_of(model: BaseAlgorithm) -> dict[str, float]:
+    """The sparsity that each network of a model was asked for; 0 throughout for a dense one.
+
+    :raises UnsupportedError: as :func:`sparsify`
+    """
+    policy = model.policy
+    if isinstance(policy, SparsePolicyMixin):
+        sizes = {network.name: network.size for network in policy.sparse.networks}
+        return policy.sparsity_config.by_network(sizes)
+    return dict.fromkeys(_sparse_class(model).networks, 0.0)
+
+
+def magnitude_mask(
+    weights: NDArray[np.float32], active: NDArray[np.bool_], count: int
+) -> NDArray[np.bool_]:
+    """True at the ``count`` active weights of largest magnitude; ties keep the lowest index.
+
+    :param weights: shape ``(n,)``
+    :param active: which may stay, shape ``(n,)``
+    :param count: at most as many as are active
+    """
+    mask = np.zeros(weights.size, dtype=np.bool_)
+    mask[largest(np.where(active, np.abs(weights), -1.0), count)] = True
+    return mask
+
+
+def _sparse_class(model: BaseAlgorithm) -> type[SparsePolicyMixin]:
+    """The sparse counterpart of a model's policy class."""
+    supported = supported_algorithms()
+    if not isinstance(model, tuple(supported.values())):
+        raise UnsupportedError(
+            f"{type(model).__name__} has no sparse policy; supported are {', '.join(supported)}"
+        )
+    own = type(model.policy)
+    if issubclass(own, SparsePolicyMixin):
+        return own
+    aliases = model.policy_aliases
+    for name, policy_class in aliases.items():
+        if policy_class is own and (found := aliases.get(f"Sparse{name}")) is not None:
+            assert issubclass(found, SparsePolicyMixin)
+            return found
+    names = [name for name in aliases if f"Sparse{name}" in aliases]
+    raise UnsupportedError(
+        f"the policy {own.__module__}.{own.__qualname__} is none of SB3's own for "
+        f"{type(model).__name__} ({', '.join(names)}) and not sparse. Train it with one of these; "
+        "custom networks are welcome in policy_kwargs"
+    )
+
+
+def _pruned(model: BaseAlgorithm, data: Mapping[str, Any], saved: State) -> State:
+    """What the state_dict of the twin's policy shall be.
+
+    :param data: what the twin is made from
+    :param saved: state_dict of the model's policy
+    """
+    policy = _masked_policy(data)
+    for layer in policy.sparse.layers:
+        assert isinstance(layer, MaskedLayer)
+        layer.set_mask(np.ones(layer.size, dtype=np.bool_))
+    weights = {key: value for key, value in saved.items() if not key.endswith(MASK)}
+    found = policy.load_state_dict(weights, strict=False)
+    missing = [key for key in found.missing_keys if not key.endswith((MASK, "_extra_state"))]
+    if missing or found.unexpected_keys:
+        raise UnsupportedError(
+            f"{type(model.policy).__name__} has other parameters than "
+            f"{type(policy).__name__} with the same policy_kwargs: "
+            f"{', '.join([*missing, *found.unexpected_keys])}"
+        )
+    for layer in policy.sparse.layers:
+        assert isinstance(layer, MaskedLayer)
+        mask = saved.get(f"{layer.name}{MASK}")
+        active = np.ones(layer.size, dtype=np.bool_) if mask is None else mask.numpy().ravel()
+        has = int(active.sum())
+        if has < layer.final_nnz:
+            config = policy.sparsity_config
+            raise ConfigError(
+                f"sparsity={config.sparsity} ({config.distribution}) asks for {layer.final_nnz} "
+                f"connections in {layer.name}, of which {has} are left: a sparse model can only "
+                f"lose connections. Its networks have {sparsity_of(model)}; give as much or more, "
+                "and leave distribution and dense_layers out"
+            )
+        layer.set_mask(magnitude_mask(layer.dense(), active, layer.final_nnz))
+        layer.mask_targets()
+    state: State = policy.state_dict()
+    return state
+
+
+def _masked_policy(data: Mapping[str, Any]) -> SparsePolicyMixin:
+    """A new policy of the twin's kind, on the CPU and with masks."""
+    policy_class: type[SparsePolicyMixin] = data["policy_class"]
+    kwargs = {**copy.deepcopy(data["policy_kwargs"]), "compute": "masked"}
+    if data["use_sde"]:
+        kwargs["use_sde"] = True
+    with th.random.fork_rng(devices=[]):
+        return policy_class(
+            data["observation_space"], data["action_space"], policy_class._dummy_schedule, **kwargs
+        )

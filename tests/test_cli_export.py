@@ -1,0 +1,145 @@
+from __future__ import annotations
+
+import pickle
+import sys
+
+import numpy as np
+import pytest
+from stable_baselines3.common.save_util import load_from_zip_file, save_to_zip_file
+from support import make
+
+from sb3_sparse import cli
+from sb3_sparse.export.numpy_policy import Policy
+from sb3_sparse.zoo.run import Run
+from sb3_sparse.zoo.saved import algo_of, find_saved
+from sb3_sparse.zoo.train import train
+
+QUICK = dict(n_timesteps=300, eval_freq=100, eval_episodes=2)
+
+
+def command(monkeypatch, capsys, *arguments):
+    """Exit code and output of ``sb3-sparse``."""
+    monkeypatch.setattr(sys, "argv", ["sb3-sparse", *map(str, arguments)])
+    monkeypatch.setenv("COLUMNS", "200")
+    code = 0
+    try:
+        cli.main()
+    except SystemExit as stop:
+        code = stop.code or 0
+    said = capsys.readouterr()
+    return code, " ".join((said.out + said.err).split())
+
+
+@pytest.fixture(scope="module")
+def run_folder(tmp_path_factory):
+    settings = dict(normalize=True, n_steps=64, batch_size=32, net_arch=[16, 16])
+    run = Run(
+        algo="ppo", env_id="Pendulum-v1", method="set", sparsity=0.5, hyperparams=settings, **QUICK
+    )
+    return train(run, tmp_path_factory.mktemp("logs")).folder
+
+
+@pytest.mark.parametrize("to", ["c", "numpy", "onnx", "dense"])
+def test_a_run_is_exported_with_its_normalisation(run_folder, to, monkeypatch, capsys, tmp_path):
+    code, said = command(monkeypatch, capsys, "export", run_folder, "--to", to, tmp_path / "p")
+    assert code == 0, said
+    assert "1000 recorded and 1000 random observations" in said
+    if to == "numpy":
+        saved = find_saved(run_folder)
+        model, policy = saved.load(), Policy(tmp_path / "p.npz")
+        normalization = pickle.loads(saved.vecnormalize.read_bytes())
+        raw = np.random.default_rng(0).normal(size=(9, 3)).astype(np.float32)
+        expected, _ = model.predict(normalization.normalize_obs(raw), deterministic=True)
+        np.testing.assert_allclose(policy(raw), expected, atol=1e-5)
+        assert not np.allclose(policy(raw), model.predict(raw, deterministic=True)[0], atol=1e-3)
+
+
+def test_a_zip_in_a_run_folder_knows_its_run(run_folder, monkeypatch, capsys, tmp_path):
+    for arguments in ([run_folder / "best_model.zip"], [run_folder, "--best"]):
+        code, said = command(
+            monkeypatch, capsys, "export", *arguments, tmp_path / "policy.onnx", "--to", "onnx"
+        )
+        assert code == 0, said
+        assert "1000 recorded" in said
+    assert find_saved(run_folder / "best_model.zip").vecnormalize is not None
+    assert find_saved(run_folder / "best_model").path.suffix == ".zip"
+
+
+def test_missing_statistics_are_an_error(run_folder, monkeypatch, capsys, tmp_path):
+    statistics = run_folder / "Pendulum-v1" / "vecnormalize.pkl"
+    elsewhere = statistics.rename(tmp_path / "elsewhere.pkl")
+    try:
+        code, said = command(monkeypatch, capsys, "export", run_folder, tmp_path / "policy")
+        assert code == 2
+        assert "normalised its observations" in said
+        assert "give the statistics with --vecnormalize FILE" in said
+        assert not (tmp_path / "policy.c").exists()
+        code, said = command(
+            monkeypatch,
+            capsys,
+            "export",
+            run_folder,
+            tmp_path / "policy",
+            "--vecnormalize",
+            elsewhere,
+        )
+        assert code == 0, said
+    finally:
+        elsewhere.rename(statistics)
+
+
+def test_a_zip_alone(monkeypatch, capsys, tmp_path):
+    make("DQN", policy="MlpPolicy").save(tmp_path / "model.zip")
+    zip_file = tmp_path / "model.zip"
+    code, said = command(monkeypatch, capsys, "export", zip_file, tmp_path / "policy", "--int8")
+    assert code == 0, said
+    assert "no observations were recorded; --env ID" in said
+    assert "8-bit weights against float32" in said
+    code, said = command(
+        monkeypatch, capsys, "export", zip_file, tmp_path / "policy", "--env", "CartPole-v1"
+    )
+    assert code == 0, said
+    assert "1000 recorded" in said
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["no.zip"], "there is no file"),
+        (
+            ["model.zip", "--to", "tflite"],
+            "--to must be one of c, numpy, onnx, dense, got 'tflite'",
+        ),
+        (["model.zip", "--to", "onnx", "--int8"], "int8 is for to='c' only"),
+        (["model.zip", "--vecnormalize", "no.pkl"], "there is no file no.pkl; give what"),
+        (["model.zip", "--algo", "dreamer"], "unknown algorithm 'dreamer'; allowed are dqn"),
+        (["model.zip", "--env", "NoSuch-v0"], "NoSuch"),
+        (["broken.zip"], "is no model saved by SB3"),
+        (["masks.zip"], "masks and weights disagree"),
+        (["."], "there is no run in"),
+    ],
+)
+def test_mistakes_are_one_line(arguments, message, monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    model = make("DQN")
+    model.save("model.zip")
+    (tmp_path / "broken.zip").write_text("nothing")
+    data, params, variables = load_from_zip_file("model.zip")
+    weight, mask = (params["policy"][f"q_net.q_net.0.{n}"] for n in ("weight", "weight_mask"))
+    weight[~mask.bool()] = 1.0
+    save_to_zip_file("masks.zip", data, params, variables)
+    model_file, *rest = arguments
+    code, said = command(monkeypatch, capsys, "export", model_file, "policy", *rest)
+    assert code == 2
+    assert message in said
+    assert said.startswith("Error:")
+    assert not list(tmp_path.glob("policy*"))
+
+
+@pytest.mark.parametrize(
+    "algorithm", ["DQN", "QRDQN", "SAC", "TQC", "CrossQ", "TD3", "PPO", "A2C", "TRPO"]
+)
+@pytest.mark.parametrize("policy", ["SparsePolicy", "MlpPolicy"])
+def test_a_file_tells_its_algorithm(algorithm, policy, tmp_path):
+    make(algorithm, policy=policy).save(tmp_path / "model.zip")
+    assert algo_of(tmp_path / "model.zip") == algorithm.lower()
