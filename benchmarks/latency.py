@@ -1,10 +1,10 @@
 """How long one action takes, and how many bytes a policy is, in every form that it can be run in.
 
-Actors of SAC with random masks (ERK), at batch 1 on one thread. All variants of a case are timed in
-turn in one process, in short bursts; the medians of bursts and of their ratios are what counts.
-Rows are appended to a CSV file as they come.
+Actors of SAC with random masks (ERK), at batch 1 on one thread; "narrow dense" has as many
+parameters. All variants of a case are timed in turn in one process, in short bursts; the medians of
+bursts and of their ratios are what counts. Rows are appended to a CSV file as they come.
 
-    python benchmarks/latency.py                        # every case, about ten minutes
+    python benchmarks/latency.py                        # every case, two or three minutes
     python benchmarks/latency.py --sizes 17-256-256-6 --sparsities 95
 """
 
@@ -33,6 +33,7 @@ from step_overhead import RandomEnv
 from sb3_sparse import SparsePolicy
 from sb3_sparse.export import export
 from sb3_sparse.export.artifact import compiler
+from sb3_sparse.sparsity.widths import equivalent_widths, mlp_parameters
 
 SIZES = ("17-256-256-6", "348-256-256-17", "348-1024-1024-17")
 SPARSITIES = (80, 90, 95, 99)
@@ -160,6 +161,12 @@ def variants(sizes: list[int], sparsity: float, folder: Path) -> Variants:
     export(sparse, folder / "sparse", "numpy")
     export(sparse, folder / "int8", "c", int8=True)
     export(dense, folder / "dense", "onnx")
+    widths, _ = equivalent_widths(
+        sizes[1:-1],
+        lambda hidden: mlp_parameters(sizes[0], hidden, sizes[-1]),
+        report.nnz + sum(sizes[1:]),
+    )
+    export(actor([sizes[0], *widths, sizes[-1]], 0.0), folder / "narrow", "c")
     weights = report.dense_bytes
     empty, nothing = empty_session(folder), {"obs": np.zeros((1, 1), np.float32)}
     session = session_of(folder / "dense.onnx")
@@ -190,6 +197,7 @@ def variants(sizes: list[int], sparsity: float, folder: Path) -> Variants:
         "numpy": (looped(policy, each), (folder / "sparse.npz").stat().st_size),
         **c_bursts(folder / "sparse.c", rows, sizes[-1], KINDS),
         **c_bursts(folder / "int8.c", rows, sizes[-1], {"C, int8": PLAIN}),
+        **c_bursts(folder / "narrow.c", rows, sizes[-1], {"C, narrow dense": PLAIN}),
     }
 
 

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import re
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from stable_baselines3 import SAC
 from support import assert_masked, make
 
 from sb3_sparse import SparsePolicy, cli
+from sb3_sparse.export import export
 from sb3_sparse.topology import registry
 from sb3_sparse.tuning import space_of
 from sb3_sparse.tuning.spaces import check_space
@@ -160,3 +164,42 @@ def test_the_config_of_the_documents_trains(tmp_path):
     assert outcome.finished
     assert outcome.model.learning_rate(1.0) == 1e-3
     assert abs(outcome.model.policy.sparse.sparsity - 0.95) < 0.001
+
+
+def export_commands() -> list[str]:
+    text = (ROOT / "README.md").read_text() + (ROOT / "docs/deploy.md").read_text()
+    lines = "".join(re.findall(r"```sh\n(.*?)```", text, re.DOTALL)).splitlines()
+    return [line for line in lines if line.startswith(("sb3-sparse export", "sb3-sparse compress"))]
+
+
+@pytest.mark.parametrize("command", export_commands())
+def test_the_export_and_compress_commands_of_the_documents_are_understood(command, monkeypatch):
+    asked = []
+
+    def note(path, **options):
+        asked.append((path, options))
+        raise Enough
+
+    monkeypatch.setattr("sb3_sparse.zoo.saved.find_saved", note)
+    with pytest.raises(Enough):
+        cli.app(shlex.split(command, comments=True)[1:], standalone_mode=False)
+    ((path, _),) = asked
+    assert path.name in ("HalfCheetah-v5_1", "Hopper-v5_1", "model.zip")
+
+
+def test_the_programs_of_the_deployment_document_run(tmp_path):
+    text = (ROOT / "docs/deploy.md").read_text()
+    (main,) = re.findall(r"```c\n(.*?)```", text, re.DOTALL)
+    (command,) = [line for line in text.splitlines() if line.startswith("cc ")]
+    (loader,) = python_blocks("docs/deploy.md")
+    model = make("SAC")
+    export(model, tmp_path / "policy", "c")
+    export(model, tmp_path / "policy", "numpy")
+    (tmp_path / "main.c").write_text(main)
+    said = subprocess.run(command, shell=True, cwd=tmp_path, capture_output=True, check=True).stdout
+    action, _ = model.predict(np.zeros(3, np.float32), deterministic=True)
+    assert [float(line) for line in said.split()] == pytest.approx([action[0]] * 3, abs=1e-5)
+    code = f"observation = [0.0, 0.0, 0.0]\n{loader}\nprint(action[0])"
+    python = [sys.executable, "-c", code]
+    said = subprocess.run(python, cwd=tmp_path, capture_output=True, check=True).stdout
+    assert float(said) == pytest.approx(action[0], abs=1e-5)
