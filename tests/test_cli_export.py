@@ -114,6 +114,11 @@ def test_a_zip_alone(monkeypatch, capsys, tmp_path):
         (["model.zip", "--vecnormalize", "no.pkl"], "there is no file no.pkl; give what"),
         (["model.zip", "--algo", "dreamer"], "unknown algorithm 'dreamer'; allowed are dqn"),
         (["model.zip", "--env", "NoSuch-v0"], "NoSuch"),
+        (
+            ["model.zip", "--env", "Pendulum-v1"],
+            "shows observations of shape (3,), the model takes",
+        ),
+        (["model.zip", "--env", "TinyImages-v0"], "observations of shape (36, 36, 1), the model"),
         (["broken.zip"], "is no model saved by SB3"),
         (["masks.zip"], "masks and weights disagree"),
         (["."], "there is no run in"),

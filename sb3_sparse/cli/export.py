@@ -64,5 +64,6 @@ def export(
     console.print(str(report), soft_wrap=True)
     if observations is None:
         console.print(
-            "note: no observations were recorded; --env ID compares them on an environment's, too"
+            "note: no observations were recorded; --env ID compares them on an environment's, too",
+            soft_wrap=True,
         )

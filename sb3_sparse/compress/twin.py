@@ -13,12 +13,13 @@ import torch as th
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.save_util import load_from_zip_file, save_to_zip_file
+from stable_baselines3.common.save_util import save_to_zip_file
 
 from sb3_sparse.engine.masked import MaskedLayer
 from sb3_sparse.errors import ConfigError, UnsupportedError
 from sb3_sparse.policies.aliases import supported_algorithms
 from sb3_sparse.policies.mixin import SparsePolicyMixin
+from sb3_sparse.policies.saving import parts_of
 from sb3_sparse.sparsity.selection import largest
 
 Algorithm = TypeVar("Algorithm", bound=BaseAlgorithm)
@@ -60,12 +61,7 @@ def sparsify(
     Source: magnitude pruning, arXiv:1506.02626; shared out by layer as arXiv:1911.11134, section 3.
     """
     policy_class = _sparse_class(model)
-    file = io.BytesIO()
-    model.save(file)
-    file.seek(0)
-    data, loaded, variables = load_from_zip_file(file, device="cpu")
-    assert data is not None
-    params: dict[str, Any] = dict(loaded)
+    data, params, variables = parts_of(model)
     given = {"distribution": distribution, "dense_layers": dense_layers, "compute": compute}
     data["policy_class"] = policy_class
     data["policy_kwargs"] = {

@@ -117,7 +117,7 @@ class _Writer:
             self._max_pool(node, x, y)
         elif isinstance(node, Argmax):
             self.functions["argmax"] = ckernels.ARGMAX
-            sizes = self._table("sizes", node.sizes, "uint16_t")
+            sizes = self._table("sizes", node.sizes, "uint32_t")
             self.calls.append(f"argmax({x}, {y}, {len(node.sizes)}, {sizes});")
         elif isinstance(node, (Affine, Clip)):
             places = int(np.prod(node.shape[1:]))
@@ -236,7 +236,7 @@ class _Writer:
 
     @staticmethod
     def _bits(count: int) -> int:
-        return 16 if count <= 2**16 else 32
+        return 16 if count < 2**16 else 32  # a length may be the count
 
     def _place(self, value: int) -> str:
         if value == 0:

@@ -149,7 +149,7 @@ static void max_pool(const float *x, float *y, uint32_t units, uint32_t height, 
 }
 """
 ARGMAX = """\
-static void argmax(const float *x, float *y, uint32_t n, const uint16_t *size)
+static void argmax(const float *x, float *y, uint32_t n, const uint32_t *size)
 {
     for (; n; n--, x += *size++) {
         uint32_t i, best = 0;

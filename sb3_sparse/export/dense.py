@@ -12,12 +12,13 @@ import stable_baselines3
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.save_util import is_json_serializable, load_from_zip_file
+from stable_baselines3.common.save_util import is_json_serializable
 
 from sb3_sparse.errors import UnsupportedError
 from sb3_sparse.export.pathless import pickled
 from sb3_sparse.policies.config import SparsityConfig
 from sb3_sparse.policies.named import import_named
+from sb3_sparse.policies.saving import parts_of
 
 STOCK = ("stable_baselines3.", "sb3_contrib.")
 FORGOTTEN = (
@@ -40,12 +41,7 @@ def write_dense(model: BaseAlgorithm) -> bytes:
 
     :raises UnsupportedError: if the model has classes of this package that SB3 lacks
     """
-    file = io.BytesIO()
-    model.save(file)
-    file.seek(0)
-    data, loaded, variables = load_from_zip_file(file, device="cpu")
-    assert data is not None
-    params: dict[str, Any] = dict(loaded)
+    data, params, variables = parts_of(model)
     data["policy_class"] = _stock_class(type(model.policy))
     data["policy_kwargs"] = _stock_kwargs(model.policy, data["policy_kwargs"])
     for name in FORGOTTEN:

@@ -45,8 +45,8 @@ def plan_memory(graph: Graph) -> Memory:
     last_use = [0] * (last_value + 1)
     for value, node in enumerate(graph.nodes, start=1):
         before = node.inputs[0]
-        alone = len(graph.users(before)) == 1
-        if isinstance(node, Flatten) or (isinstance(node, IN_PLACE) and home[before] and alone):
+        in_place = isinstance(node, IN_PLACE) and home[before] and _read_once(graph, before)
+        if isinstance(node, Flatten) or in_place:
             home[value] = home[before] if value != last_value else value
         for taken in node.inputs:
             last_use[home[taken]] = value
@@ -76,3 +76,13 @@ def plan_memory(graph: Graph) -> Memory:
         elif home[value] in places:
             places[value] = places[home[value]]
     return Memory(size, places, borders)
+
+
+def _read_once(graph: Graph, value: int) -> bool:
+    """Whether one node alone reads a value, or what it is another view of."""
+    while len(graph.users(value)) == 1:
+        node = graph.nodes[value - 1]
+        if not isinstance(node, Flatten):
+            return True
+        value = node.inputs[0]
+    return False

@@ -68,7 +68,14 @@ def record_observations(model: BaseAlgorithm, env: VecEnv, count: int) -> Observ
 
     :param env: with the model's own wrappers, normalised or not; its statistics stay as they are
     :param count: how many
+    :raises ConfigError: if the environment shows other observations than the model takes
     """
+    shown, taken = env.observation_space.shape, model.observation_space.shape
+    if shown != taken and (shown is None or (*shown[2:], *shown[:2]) != taken):
+        raise ConfigError(
+            f"the environment shows observations of shape {shown}, the model takes {taken}; a "
+            "run's folder tells which wrappers and stacked frames belong to it, a zip does not"
+        )
     normalization = unwrap_vec_normalize(env)
     training = normalization is not None and normalization.training
     if normalization is not None:

@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import (
 from sb3_sparse.errors import ConfigError, MissingExtra
 from sb3_sparse.zoo.environments import is_atari, known_environment
 from sb3_sparse.zoo.experiment import quiet, saved_settings
-from sb3_sparse.zoo.saved import Saved, arguments_of, data_of
+from sb3_sparse.zoo.saved import Saved, arguments_of, read_zip
 
 try:
     from rl_zoo3.utils import create_test_env
@@ -34,7 +34,7 @@ def training_envs(saved: Saved, n_envs: int | None, seed: int) -> VecEnv:
     :raises ConfigError: if the environment is not known, or not to be found
     """
     if n_envs is None:
-        n_envs = int(data_of(saved.path)["n_envs"])
+        n_envs = int(read_zip(saved.path)[0]["n_envs"])
     if n_envs < 1:
         raise ConfigError(f"n_envs must be 1 or more, got {n_envs}")
     return _envs(saved, n_envs, seed, training=True)

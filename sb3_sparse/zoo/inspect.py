@@ -5,14 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
-
-from stable_baselines3.common.save_util import load_from_zip_file
 
 from sb3_sparse.engine.auto import Choice, choose
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.policies.mixin import SparsePolicyMixin
 from sb3_sparse.policies.report import SparsityReport
+from sb3_sparse.zoo.saved import read_zip, zip_path
 from sb3_sparse.zoo.threads import use_few_threads
 
 
@@ -43,16 +41,8 @@ def _load(path: Path) -> tuple[SparsePolicyMixin, dict[str, Any]]:
 
     :raises ConfigError: if there is no such file, or no sparse policy in it
     """
-    if not path.suffix and path.with_suffix(".zip").is_file():
-        path = path.with_suffix(".zip")  # as SB3 does
-    if not path.is_file():
-        raise ConfigError(f"there is no file {path}; give a model saved by SB3, e.g. model.zip")
-    try:
-        data, params, _ = load_from_zip_file(path, device="cpu")
-    except (BadZipFile, ValueError) as error:
-        raise ConfigError(f"{path} is no model saved by SB3: {error}") from error
-    if data is None or "policy" not in params:
-        raise ConfigError(f"{path} is damaged: it has no data or no policy in it")
+    path = zip_path(path)
+    data, state = read_zip(path)
     policy_class = data.get("policy_class")
     if not (isinstance(policy_class, type) and issubclass(policy_class, SparsePolicyMixin)):
         name = getattr(policy_class, "__name__", "none")
@@ -63,7 +53,6 @@ def _load(path: Path) -> tuple[SparsePolicyMixin, dict[str, Any]]:
     policy = policy_class(
         data["observation_space"], data["action_space"], policy_class._dummy_schedule, **kwargs
     )
-    state: Any = params["policy"]
     policy.load_state_dict(state)
     return policy, data
 

@@ -88,8 +88,7 @@ def find_saved(
     params = _params_of(folder, arguments["env"]) if arguments else None
     if path.is_dir():
         path = model_in(folder, arguments["env"], best)
-    elif not path.suffix and path.with_suffix(".zip").is_file():
-        path = path.with_suffix(".zip")  # as SB3 does
+    path = zip_path(path)
     if vecnormalize is None and params is not None and saved_settings(params).get("normalize"):
         vecnormalize = params / VECNORMALIZE
         if not vecnormalize.is_file():
@@ -112,7 +111,7 @@ def algo_of(path: Path) -> str:
 
     :raises ConfigError: if it is no model, or of an algorithm that is not supported
     """
-    data = data_of(path)
+    data, _ = read_zip(path)
     policy = data.get("policy_class")
     names = [cls.__name__ for cls in policy.__mro__] if isinstance(policy, type) else []
     for name, algo in BY_POLICY.items():
@@ -127,20 +126,27 @@ def algo_of(path: Path) -> str:
     )
 
 
-def data_of(path: Path) -> dict[str, Any]:
-    """What SB3 saved beside the weights.
+def read_zip(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """What SB3 saved: data, and the policy's state_dict.
 
     :raises ConfigError: if there is no such file, or it is no model
     """
     if not path.is_file():
         raise ConfigError(f"there is no file {path}; give a model saved by SB3, e.g. model.zip")
     try:
-        data, _, _ = load_from_zip_file(path, device="cpu")
+        data, params, _ = load_from_zip_file(path, device="cpu")
     except (BadZipFile, ValueError) as error:
         raise ConfigError(f"{path} is no model saved by SB3: {error}") from error
-    if data is None:
-        raise ConfigError(f"{path} is damaged: it has no data in it")
-    return data
+    if data is None or "policy" not in params:
+        raise ConfigError(f"{path} is damaged: it has no data or no policy in it")
+    state: Any = params["policy"]
+    return data, state
+
+
+def zip_path(path: Path) -> Path:
+    """The path with the suffix that SB3 adds, where it was left out."""
+    with_suffix = path.with_suffix(".zip")
+    return with_suffix if not path.suffix and with_suffix.is_file() else path
 
 
 def check_masks(path: Path) -> None:
@@ -148,8 +154,7 @@ def check_masks(path: Path) -> None:
 
     :raises CorruptStateError: if so
     """
-    _, params, _ = load_from_zip_file(path, load_data=False, device="cpu")
-    state: Any = params.get("policy", {})
+    _, state = read_zip(path)
     for name, mask in state.items():
         if name.endswith("_mask") and name.removesuffix("_mask") in state:
             weight = state[name.removesuffix("_mask")]

@@ -5,7 +5,7 @@ import subprocess
 
 import numpy as np
 import pytest
-from export.tools import COMPILER, chain, compiles, random_chain
+from export.tools import COMPILER, chain, compiles, linear, random_chain, relu
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import TinyImages, make
@@ -14,7 +14,7 @@ from sb3_sparse.export import export
 from sb3_sparse.export.artifact import OPTIONS, compiled
 from sb3_sparse.export.c import write_c
 from sb3_sparse.export.extract import graph_of
-from sb3_sparse.export.graph import Graph
+from sb3_sparse.export.graph import Add, Conv, Flatten, Graph
 from sb3_sparse.export.layout import grouped
 from sb3_sparse.export.memory import plan_memory
 from sb3_sparse.export.quantize import quantize_rows, quantized
@@ -88,7 +88,7 @@ def test_indices_have_16_bits_where_they_fit_and_32_where_not():
         [[0.5 + 2 * o[1] + 3 * o[69_999]] for o in observations],
         rtol=1e-6,
     )
-    narrow = write_c(chain(65_536, (weight[:, :65_536], [0.5])), "0").source
+    narrow = write_c(chain(65_535, (weight[:, :65_535], [0.5])), "0").source
     assert "uint16_t column_1" in narrow
     assert "uint32_t column_1" not in narrow
 
@@ -146,16 +146,31 @@ def test_no_value_of_a_policy_is_overwritten_while_it_is_needed(models, kind):
     check_memory(graph_of(models[kind], None))
 
 
+def test_nothing_is_written_over_a_value_that_another_view_of_it_shows():
+    layer = Conv((0,), (1, 1, 2), np.ones((1, 1, 1, 1), np.float32), np.zeros(1), (1, 1), (0, 0))
+    view = Flatten((1,), (2,))
+    below = linear(3, [[1, 0], [0, 1]])
+    again = Flatten((1,), (2,))
+    graph = Graph((1, 1, 2), (layer, view, relu(2, 2), below, again, Add((4, 5), (2,))), (2,))
+    check_memory(graph)
+    seen = np.float32([[[[-3.0, 4.0]]]])
+    np.testing.assert_array_equal(compiled(write_c(graph, "0").source, graph)(seen), [[-3, 8]])
+
+
 def check_memory(graph: Graph):
     """Write a value's number into its place; nobody may have overwritten it when it is read."""
     memory = plan_memory(graph)
     floats = np.zeros(memory.size, np.int64)
+    names = {0: 0}
     for value, node in enumerate(graph.nodes, start=1):
         for taken in node.inputs:
             if taken in memory.places:
                 start = memory.places[taken]
-                assert (floats[start : start + int(np.prod(graph.shape_of(taken)))] == taken).all()
-        if value in memory.places:
+                size = int(np.prod(graph.shape_of(taken)))
+                assert (floats[start : start + size] == names[taken]).all()
+        view = isinstance(node, Flatten)
+        names[value] = names[node.inputs[0]] if view else value
+        if value in memory.places and not view:
             start = memory.places[value]
             floats[start : start + int(np.prod(node.shape))] = value
     assert memory.size <= sum(int(np.prod(node.shape)) for node in graph.nodes) * 2
