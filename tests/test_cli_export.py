@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import pickle
+import shutil
 import sys
 
 import numpy as np
@@ -88,6 +89,28 @@ def test_missing_statistics_are_an_error(run_folder, monkeypatch, capsys, tmp_pa
         elsewhere.rename(statistics)
 
 
+def test_an_export_does_not_overwrite_its_model(monkeypatch, capsys, tmp_path):
+    make("DQN").save(tmp_path / "model.zip")
+    before = (tmp_path / "model.zip").read_bytes()
+    for out in ("model", "model.zip"):
+        code, said = command(
+            monkeypatch, capsys, "export", tmp_path / "model.zip", tmp_path / out, "--to", "dense"
+        )
+        assert code == 2
+        assert "would be overwritten by its own export" in said
+    assert (tmp_path / "model.zip").read_bytes() == before
+
+
+def test_a_zip_of_a_normalised_run_alone_needs_its_statistics(
+    run_folder, monkeypatch, capsys, tmp_path
+):
+    alone = shutil.copy(run_folder / "Pendulum-v1.zip", tmp_path / "alone.zip")
+    for arguments in (["export", alone], ["compress", alone, "--env", "Pendulum-v1"]):
+        code, said = command(monkeypatch, capsys, *arguments)
+        assert code == 2
+        assert "give its statistics with --vecnormalize FILE" in said
+
+
 def test_a_zip_alone(monkeypatch, capsys, tmp_path):
     make("DQN", policy="MlpPolicy").save(tmp_path / "model.zip")
     zip_file = tmp_path / "model.zip"
@@ -112,6 +135,7 @@ def test_a_zip_alone(monkeypatch, capsys, tmp_path):
         ),
         (["model.zip", "--to", "onnx", "--int8"], "int8 is for to='c' only"),
         (["model.zip", "--vecnormalize", "no.pkl"], "there is no file no.pkl; give what"),
+        (["model.zip", "--algo", "sac"], "model.zip is a model of dqn, not of sac; leave --algo"),
         (["model.zip", "--algo", "dreamer"], "unknown algorithm 'dreamer'; allowed are dqn"),
         (["model.zip", "--env", "NoSuch-v0"], "NoSuch"),
         (

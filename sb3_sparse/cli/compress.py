@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
@@ -93,6 +94,8 @@ def compress(
     finally:
         training.close()
         evaluation.close()
+        with suppress(OSError):
+            folder.rmdir()  # if it is empty, since something was refused
     _say(str(outcome))
     _say(f"Model: {outcome.path}")
     _say("Look at it, or take it elsewhere:")

@@ -44,6 +44,8 @@ def export(
     if to not in FORMATS:
         raise ConfigError(f"--to must be one of {', '.join(FORMATS)}, got {to!r}")
     saved = find_saved(model, best=best, algo=algo, env_id=env, vecnormalize=vecnormalize)
+    if to == "dense" and _as_zip(out).resolve() == saved.path.resolve():
+        raise ConfigError(f"{saved.path} would be overwritten by its own export; give another name")
     loaded = saved.load()
     observations = None
     if saved.env_id is not None:
@@ -67,3 +69,8 @@ def export(
             "note: no observations were recorded; --env ID compares them on an environment's, too",
             soft_wrap=True,
         )
+
+
+def _as_zip(out: Path) -> Path:
+    """Where a dense zip goes."""
+    return out / "policy.zip" if out.is_dir() else out.with_suffix(".zip")

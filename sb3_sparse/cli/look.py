@@ -31,7 +31,7 @@ def enjoy(
 
 
 def inspect(
-    model: Annotated[Path, typer.Argument(help="A model saved by SB3 (.zip).")],
+    model: Annotated[Path, typer.Argument(help="A run's folder, or a model saved by SB3 (.zip).")],
 ) -> None:
     """Print the layers of a saved sparse model, and how they are best computed on this machine."""
     console.print(str(inspect_model(model)), soft_wrap=True)

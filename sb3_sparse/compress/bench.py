@@ -92,7 +92,7 @@ class Bench:
         normalize = self.model.get_vec_normalize_env()
         if normalize is not None:
             saved = VecNormalize.load(str(path.with_suffix(".pkl")), normalize.venv)
-            self._kept = {name: getattr(saved, name) for name in NORMALIZATION}
+            self._kept = _statistics_of(saved)
 
     def make(self, number: int, sparsity: float) -> int:
         """Prune the last accepted model and fine-tune it; connections of its acting network."""
@@ -176,10 +176,19 @@ class Bench:
         normalize = self.model.get_vec_normalize_env()
         if normalize is None:
             return {}
-        return {name: copy.deepcopy(getattr(normalize, name)) for name in NORMALIZATION}
+        return _statistics_of(normalize)
 
     @staticmethod
     def _set_statistics(env: VecEnv | None, statistics: dict[str, Any]) -> None:
         normalize = None if env is None else unwrap_vec_normalize(env)
         if normalize is not None:
             vars(normalize).update(copy.deepcopy(statistics))
+
+
+def _statistics_of(normalize: VecNormalize) -> dict[str, Any]:
+    """A copy of what a VecNormalize has seen; without norm_obs it has no obs_rms."""
+    return {
+        name: copy.deepcopy(found)
+        for name, found in vars(normalize).items()
+        if name in NORMALIZATION
+    }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from sb3_sparse.compress.result import Compression
 from sb3_sparse.compress.search import Rules, search
 from sb3_sparse.compress.state import State, fingerprint, open_state
 from sb3_sparse.compress.twin import sparsity_of
-from sb3_sparse.errors import ConfigError
+from sb3_sparse.errors import ConfigError, CorruptStateError
 from sb3_sparse.sparsity.distributions import check_distribution, check_sparsity
 
 MAX_DROP = 0.03
@@ -28,7 +29,7 @@ FRESH = 1000
 def compress(
     model: BaseAlgorithm,
     eval_env: VecEnv,
-    folder: Path,
+    folder: str | Path,
     *,
     max_drop: float | None = None,
     sparsity: float | None = None,
@@ -83,6 +84,7 @@ def compress(
     settings |= {"deterministic": deterministic, "distribution": distribution, "name": name}
     if distribution is not None:
         check_distribution(distribution)
+    folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     state = open_state(folder, settings)
     bench = Bench(
@@ -96,12 +98,22 @@ def compress(
         goal=settings["sparsity"],
         batches=BATCHES if settings["max_drop"] is not None else 1,
     )
+    path = folder / f"{name}.zip"
     if rules.goal is not None and rules.goal <= rules.start:
         raise ConfigError(
             f"sparsity={rules.goal} is not above the {rules.start} that the {bench.network} has "
             "already; give more"
         )
-    path = folder / f"{name}.zip"
+    if rules.goal is not None and 1.0 - rules.goal < rules.floor:
+        raise ConfigError(
+            f"sparsity={rules.goal} leaves less than one connection a layer of the "
+            f"{bench.network}; allowed is up to {math.floor(1e4 * (1.0 - rules.floor)) / 1e4}"
+        )
+    if state.finished and not path.is_file():
+        raise CorruptStateError(
+            f"the compression in {folder} is finished, but {path} is missing; remove the folder "
+            "and begin anew"
+        )
     if state.finished:
         say(f"The compression in {folder} is finished")
         bench.clear()
@@ -154,9 +166,16 @@ def _settings(
         check_sparsity(sparsity)
     if steps is None:
         steps = max(10_000, model.num_timesteps // 20)
-    for what, value, least in (("steps", steps, 1), ("episodes", episodes, 2), ("seed", seed, 0)):
+    if not 0 <= seed < 2**31:
+        raise ConfigError(f"the seed must lie in [0, 2^31), got {seed}")
+    for what, value, least in (("steps", steps, 1), ("episodes", episodes, 2)):
         if value < least:
             raise ConfigError(f"{what} must be {least} or more, got {value}")
+    if not isinstance(eval_env, VecEnv):
+        raise ConfigError(
+            f"eval_env must be a VecEnv, got {type(eval_env).__name__}; wrap it, e.g. by "
+            "make_vec_env"
+        )
     check_eval_env(eval_env)
     if (model.get_vec_normalize_env() is None) != (unwrap_vec_normalize(eval_env) is None):
         raise ConfigError(

@@ -75,6 +75,8 @@ def open_state(folder: Path, settings: dict[str, Any]) -> State:
         for name in {**state.settings, **settings}
         if state.settings.get(name) != settings.get(name)
     }
+    if others and not state.levels:
+        return State(settings)  # nothing is lost but a first look
     if others:
         told = ", ".join(
             f"{name} {old!r} instead of {new!r}" for name, (old, new) in others.items()

@@ -66,7 +66,13 @@ def numpy_artifact(graph: Graph) -> Artifact:
 
     def actor() -> Actor:
         policy: Any = numpy_policy.Policy(io.BytesIO(content))  # type: ignore[no-untyped-call]
-        return lambda observations: policy(observations).reshape(len(observations), -1)
+
+        def run(observations: NDArray[Any]) -> NDArray[Any]:
+            actions = policy(observations).reshape(len(observations), -1)
+            actions[0] = np.reshape(policy(observations[0]), -1)  # one alone is served as well
+            return np.asarray(actions)
+
+        return run
 
     return Artifact({".npz": content, Path(numpy_policy.__file__).name: loader}, actor)
 
@@ -94,17 +100,20 @@ def onnx_artifact(graph: Graph, version: str) -> Artifact:
     return Artifact({".onnx": content}, actor)
 
 
-def dense_artifact(model: BaseAlgorithm, normalization: VecNormalize | None) -> Artifact:
-    """A zip of stock SB3."""
+def dense_artifact(model: BaseAlgorithm, normalised: bool) -> Artifact:
+    """A zip of stock SB3.
+
+    :param normalised: whether a VecNormalize stands before the model
+    """
     content = write_dense(model)
 
     def actor() -> Actor:
         small: Any = {"buffer_size": 1} if hasattr(model, "buffer_size") else {}
         stock = type(model).load(io.BytesIO(content), device="cpu", **small)
-        return predictor(stock, normalization)
+        return predictor(stock, None)
 
     notes = ["trained on in stock SB3, it is dense: nothing keeps the zeros"]
-    if normalization is not None:
+    if normalised:
         notes.append(
             "a zip of SB3 does not normalise observations: load the statistics with "
             "VecNormalize.load, as before"
@@ -156,8 +165,19 @@ def compiled(source: str, graph: Graph, options: tuple[str, ...] = OPTIONS) -> A
         command = [*compiler(), *options, "-shared", "-fPIC", str(path), "-o", str(library), "-lm"]
         done = subprocess.run(command, capture_output=True, text=True)
         if done.returncode:
-            raise RuntimeError(f"the C export does not compile:\n{done.stderr}")
-        function = ctypes.CDLL(str(library)).sb3_sparse_policy
+            raise UnsupportedError(
+                f"{shlex.join(command[:1])} cannot compile the C export (exit code "
+                f"{done.returncode}): {done.stderr.strip() or 'it says nothing'}. Name another "
+                "compiler in CC, or write it unchecked with force (--force)"
+            )
+        try:
+            function = ctypes.CDLL(str(library)).sb3_sparse_policy
+        except OSError as error:
+            raise UnsupportedError(
+                f"what {shlex.join(compiler())} builds does not run here ({error}), so the C "
+                "export cannot be checked; name a compiler for this machine in CC, or write it "
+                "unchecked with force (--force)"
+            ) from error
     numbers = ctypes.POINTER(ctypes.c_float)
     function.argtypes, function.restype = [numbers, numbers], None
     count = graph.nodes[-1].shape[0]

@@ -265,7 +265,8 @@ class _Writer:
 
 def _number(value: Any) -> str:
     """A float's shortest literal that C reads back as the same one."""
-    text = str(np.float32(value))
+    largest = np.finfo(np.float32).max  # C has no literal for infinity
+    text = str(np.float32(np.clip(value, -largest, largest)))
     return f"{text}f" if "." in text or "e" in text else f"{text}.0f"
 
 

@@ -17,6 +17,7 @@ from stable_baselines3.common.save_util import is_json_serializable
 from sb3_sparse.errors import UnsupportedError
 from sb3_sparse.export.pathless import pickled
 from sb3_sparse.policies.config import SparsityConfig
+from sb3_sparse.policies.mixin import SparsePolicyMixin
 from sb3_sparse.policies.named import import_named
 from sb3_sparse.policies.saving import parts_of
 
@@ -56,11 +57,19 @@ def write_dense(model: BaseAlgorithm) -> bytes:
 
 
 def _stock_class(policy: type[BasePolicy]) -> type[BasePolicy]:
+    """What a sparse policy class makes sparse; any other class itself."""
+    if not issubclass(policy, SparsePolicyMixin):
+        return policy
     for cls in policy.__mro__:
         if cls.__module__.startswith(STOCK):
             assert issubclass(cls, BasePolicy)
             return cls
-    raise UnsupportedError(f"{policy.__name__} is no subclass of a policy of SB3 or sb3-contrib")
+        if not cls.__module__.startswith("sb3_sparse."):
+            break
+    raise UnsupportedError(
+        f"{policy.__module__}.{policy.__qualname__} is a sparse policy of your own, which has no "
+        "stock class; export to onnx, numpy or c instead"
+    )
 
 
 def _stock_kwargs(policy: BasePolicy, kwargs: dict[str, Any]) -> dict[str, Any]:
@@ -68,7 +77,8 @@ def _stock_kwargs(policy: BasePolicy, kwargs: dict[str, Any]) -> dict[str, Any]:
     sparse = {*SparsityConfig.__dataclass_fields__, "weight_decay"}
     stock = {name: value for name, value in kwargs.items() if name not in sparse}
     import_named(stock)
-    stock["features_extractor_class"] = policy.features_extractor_class
+    if isinstance(policy, SparsePolicyMixin):  # which may have another by default
+        stock["features_extractor_class"] = policy.features_extractor_class
     return stock
 
 

@@ -44,7 +44,14 @@ def graph_of(model: BaseAlgorithm, normalization: VecNormalize | None) -> Graph:
     images = is_image_space(space)
     if images and policy.normalize_images:
         value = tracer.add(_scaled(value, space.shape, 1.0 / 255.0, 0.0))
-    for module in _modules(policy):
+    try:
+        modules = _modules(policy)
+    except AttributeError as error:
+        raise UnsupportedError(
+            f"{type(policy).__name__} is not built as SB3's own policies are ({error}), so it "
+            "cannot be exported"
+        ) from error
+    for module in modules:
         value = tracer.walk(module, value)
     action = model.action_space
     if _quantiles(policy):
@@ -64,7 +71,7 @@ def graph_of(model: BaseAlgorithm, normalization: VecNormalize | None) -> Graph:
             "(of one axis) and MultiBinary"
         )
     shape = action.shape or ()
-    return Graph(space.shape, tuple(tracer.nodes), tuple(shape), images)
+    return Graph(space.shape, tracer.finish(), tuple(shape), images)
 
 
 def check_observations(space: spaces.Space[Any]) -> spaces.Box | spaces.MultiBinary:

@@ -56,4 +56,4 @@ class Policy:  # takes one observation, or many: one a row
         for operation, n, inputs in self.nodes:
             values.append(operation(n, *(values[i] for i in inputs)))
         many = x.shape[: x.ndim - len(self.shapes[0])]
-        return np.moveaxis(values[-1], -1, 0).reshape(*many, *self.shapes[1])
+        return np.moveaxis(values[-1], -1, 0).reshape((*many, *self.shapes[1]))

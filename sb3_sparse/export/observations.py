@@ -100,7 +100,7 @@ def record_observations(model: BaseAlgorithm, env: VecEnv, count: int) -> Observ
 
 
 def check_recorded(observations: NDArray[Any], space: spaces.Space[Any]) -> None:
-    """Refuse recorded observations that are not of the policy's shape.
+    """Refuse recorded observations that are not finite, or not of the policy's shape.
 
     :raises ConfigError: if so
     """
@@ -110,6 +110,9 @@ def check_recorded(observations: NDArray[Any], space: spaces.Space[Any]) -> None
             f"recorded observations must have a row for each, of shape {shape} as the policy sees "
             f"it (images channels first), got an array of shape {np.shape(observations)}"
         )
+    parts = observations.values() if isinstance(observations, dict) else [observations]
+    if not all(np.isfinite(part).all() for part in parts):
+        raise ConfigError("recorded observations must be finite; some are NaN or infinite")
 
 
 def count_of(observations: Observations | None) -> int:

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from sb3_sparse.export.graph import Floats, Graph, Weighted
 
 LARGEST = 127
+SMALLEST = 1e-30
+"""A row of weights below this is 0; its scale would have no digits left."""
 
 
 def quantize_rows(rows: NDArray[Any]) -> tuple[NDArray[np.int8], Floats]:
@@ -19,7 +21,7 @@ def quantize_rows(rows: NDArray[Any]) -> tuple[NDArray[np.int8], Floats]:
     :param rows: weights, a row for each output
     """
     most = np.abs(rows).max(axis=1, initial=0.0)
-    scale = (np.where(most > 0, most, 1.0) / LARGEST).astype(np.float32)
+    scale = (np.where(most > SMALLEST, most, 1.0) / LARGEST).astype(np.float32)
     return np.rint(rows / scale[:, None]).astype(np.int8), scale
 
 

@@ -23,8 +23,11 @@ from sb3_sparse.export.graph import (
     Linear,
     MaxPool,
     Node,
+    Normalize,
 )
 
+FAR = 10.0
+"""Standard deviations from 0 at which observations are centred before anything else."""
 RENORM = "BatchRenorm"
 """sb3-contrib's normalisation (CrossQ), known by name: it need not be installed here."""
 ACTIVATIONS: dict[type[nn.Module], Callable[[Any], tuple[str, float]]] = {
@@ -47,6 +50,7 @@ FUNCTIONS = {
 }
 """What a ``forward`` may call on its own, as a function or a method."""
 ADDITIONS = (operator.add, operator.iadd, th.add, "add", "add_")
+IN_PLACE = (operator.iadd, "add_")
 ALLOWED = (
     "Linear, Conv2d, MaxPool2d, Flatten, BatchNorm, Hardtanh, Dropout, Identity, "
     + ", ".join(kind.__name__ for kind in ACTIVATIONS)
@@ -63,6 +67,8 @@ class Tracer:
 
     observation_shape: tuple[int, ...]
     nodes: list[Node] = field(default_factory=list)
+    changed: set[int] = field(default_factory=set)
+    """Values that torch changes in place."""
 
     def shape_of(self, value: int) -> tuple[int, ...]:
         """Shape of a value so far."""
@@ -79,6 +85,8 @@ class Tracer:
         :raises UnsupportedError: if it does what cannot be exported
         """
         shape = self.shape_of(value)
+        if getattr(module, "inplace", False):
+            self.changed.add(value)
         if type(module) in ACTIVATIONS:
             kind, slope = ACTIVATIONS[type(module)](module)
             return self.add(Activation((value,), shape, kind, slope))
@@ -117,7 +125,25 @@ class Tracer:
             return value
         return self.add(Flatten((value,), (int(np.prod(shape)),)))
 
+    def finish(self) -> tuple[Node, ...]:
+        """All operations.
+
+        :raises UnsupportedError: if a value that was changed in place is used otherwise, too
+        """
+        for value in self.changed:
+            if sum(value in node.inputs for node in self.nodes) > 1:
+                raise UnsupportedError(
+                    "a network that changes a value in place (inplace=True, +=) and uses it "
+                    "elsewhere too cannot be exported; build it with inplace=False"
+                )
+        return tuple(self.nodes)
+
     def _linear(self, module: nn.Linear, value: int) -> int:
+        if len(self.shape_of(value)) != 1:
+            raise UnsupportedError(
+                f"{module} of a value of shape {self.shape_of(value)} cannot be exported; allowed "
+                "are vectors: flatten it before"
+            )
         weight, bias = _arrays(module)
         return self.add(Linear((value,), (len(weight),), weight, bias))
 
@@ -152,14 +178,19 @@ class Tracer:
         """Batch normalisation as it is in evaluation: by its running statistics."""
         if getattr(module, mean) is None:
             raise UnsupportedError(f"{module} cannot be exported without running statistics")
+        centre = _array(getattr(module, mean)).astype(np.float64)
         deviation = np.sqrt(_array(getattr(module, var)).astype(np.float64) + module.eps)
+        shape = self.shape_of(value)
+        if value == 0 and len(shape) == 1 and (np.abs(centre) > FAR * deviation).any():
+            # Folded into the layer behind, such terms would cancel out and leave few digits.
+            value = self.add(Normalize((0,), shape, centre, 1.0 / deviation, np.inf))
+            centre, deviation = np.zeros_like(centre), np.ones_like(deviation)
         scale = np.ones_like(deviation)
         shift = np.zeros_like(deviation)
         if module.affine:
             scale, shift = _array(getattr(module, weight)), _array(module.bias)
         scale = scale / deviation
-        shift = shift - _array(getattr(module, mean)) * scale
-        shape = self.shape_of(value)
+        shift = shift - centre * scale
         return self.add(Affine((value,), shape, scale.astype(np.float32), shift.astype(np.float32)))
 
     def _forward(self, module: nn.Module, value: int) -> int:
@@ -189,9 +220,13 @@ class Tracer:
             values = [value for value in taken if value is not None]
             shapes = [self.shape_of(value) for value in values]
             rest = [arg for arg in node.args if not isinstance(arg, fx.Node)]
-            if target in FUNCTIONS and len(values) == 1:
+            options = dict(node.kwargs)
+            if options.pop("inplace", False) or target in IN_PLACE:
+                self.changed.add(values[0])
+            plain = not options and not rest
+            if target in FUNCTIONS and len(values) == 1 and plain:
                 return self.add(Activation((values[0],), shapes[0], FUNCTIONS[target]))
-            if target in ADDITIONS and len(values) == 2 and shapes[0] == shapes[1]:
+            if target in ADDITIONS and len(values) == 2 and shapes[0] == shapes[1] and plain:
                 return self.add(Add(tuple(values), shapes[0]))
             if target in (th.flatten, "flatten") and len(values) == 1:
                 axes: dict[str, Any] = dict(zip(("start_dim", "end_dim"), rest, strict=False))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import tempfile
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -29,6 +30,7 @@ from sb3_sparse.export.observations import Observations, check_recorded, random_
 from sb3_sparse.export.parity import TOLERANCE, Parity, ParityError, compare
 from sb3_sparse.export.quantize import quantized
 from sb3_sparse.export.units import remove_dead_units, units_of
+from sb3_sparse.policies.saving import was_normalised
 
 FORMATS = ("c", "numpy", "onnx", "dense")
 RANDOM = 1000
@@ -115,17 +117,21 @@ def export(
     if int8 and to != "c":
         raise ConfigError(f"int8 is for to='c' only, got to={to!r}")
     check_model(model)
-    normalization = normalization_of(model, vecnormalize)
+    normalization, left_out = normalization_of(model, vecnormalize), False
     space = model.observation_space
     if observations is not None:
         check_recorded(observations, space)
+    if normalization is not None and to == "dense":
+        left_out, normalization = True, None  # which happens outside of the zip, as before
+    elif normalization is not None:
+        check_statistics(model, normalization)
     random = random_observations(
         space, normalization, RANDOM_IMAGES if is_image_space(space) else RANDOM
     )
     made_by = version("sb3-sparse")
     raw = small = Graph(())
     if to == "dense":
-        artifact = dense_artifact(model, normalization)
+        artifact = dense_artifact(model, left_out)
     else:
         raw = graph_of(model, normalization)
         small = remove_dead_units(fold(raw))
@@ -184,19 +190,32 @@ def normalization_of(
     """
     if given is None:
         given = model.get_vec_normalize_env()
-    elif not isinstance(given, VecNormalize):
+        if given is None and was_normalised(model):
+            raise ConfigError(
+                "the model was trained on observations that a VecNormalize had normalised, and its "
+                "statistics are not here; give what VecNormalize.save wrote as vecnormalize "
+                "(--vecnormalize FILE)"
+            )
+    elif isinstance(given, (str, Path)):
         given = _read_normalization(Path(given))
-    if given is None or not given.norm_obs:
-        return None
-    shape = model.observation_space.shape
-    rms = given.obs_rms
-    if shape is not None and (isinstance(rms, dict) or rms.mean.shape != shape):
+    elif not isinstance(given, VecNormalize):
+        raise ConfigError(f"vecnormalize must be a VecNormalize or its file, got {given!r}")
+    return given if given is not None and given.norm_obs else None
+
+
+def check_statistics(model: BaseAlgorithm, normalization: VecNormalize) -> None:
+    """Refuse statistics of other observations than the policy takes.
+
+    :raises ConfigError: if so
+    """
+    shape, rms = model.observation_space.shape, normalization.obs_rms
+    if isinstance(rms, dict) or rms.mean.shape != shape:
         seen = "a Dict" if isinstance(rms, dict) else f"observations of shape {rms.mean.shape}"
         raise ConfigError(
-            f"the statistics are of {seen}, the policy takes shape {shape}; give those that "
-            "VecNormalize saved in the same run"
+            f"the statistics are of {seen}, the policy takes shape {shape}. Give those of the same "
+            "run; if its frames were stacked after normalisation, it can be exported as 'dense' "
+            "only, since no raw observation stands for the empty frames of a beginning"
         )
-    return given
 
 
 def _read_normalization(path: Path) -> VecNormalize:
@@ -235,13 +254,17 @@ def _failure(parity: Parity, graph: Graph) -> str:
 
 
 def _write(artifact: Artifact, main: Path) -> dict[Path, int]:
-    """Write all files, each whole or not at all."""
+    """Write all files, or none."""
     main.parent.mkdir(parents=True, exist_ok=True)
-    written = {}
-    for name, content in artifact.files.items():
-        path = main.with_suffix(name) if name.startswith(".") else main.parent / name
-        new = path.with_name(f"{path.name}.new")
-        new.write_bytes(content)
-        new.replace(path)
-        written[path] = len(content)
-    return written
+    paths = {
+        main.with_suffix(name) if name.startswith(".") else main.parent / name: content
+        for name, content in artifact.files.items()
+    }
+    with tempfile.TemporaryDirectory(dir=main.parent, prefix=".export_") as folder:
+        for path, content in paths.items():
+            if path.is_dir():
+                raise ConfigError(f"{path} is a folder and cannot be written; give another name")
+            (Path(folder) / path.name).write_bytes(content)
+        for path in paths:
+            (Path(folder) / path.name).replace(path)
+    return {path: len(content) for path, content in paths.items()}

@@ -164,7 +164,7 @@ def locked(folder: Path) -> Iterator[None]:
     try:
         lock.acquire(timeout=0)
     except Timeout as error:
-        raise ConfigError(f"another process is training the run in {folder}") from error
+        raise ConfigError(f"another process is at work in {folder}") from error
     try:
         yield
     finally:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +36,8 @@ def training_envs(saved: Saved, n_envs: int | None, seed: int) -> VecEnv:
     """
     if n_envs is None:
         n_envs = int(read_zip(saved.path)[0]["n_envs"])
+    if not 0 <= seed < 2**31:
+        raise ConfigError(f"the seed must lie in [0, 2^31), got {seed}")
     if n_envs < 1:
         raise ConfigError(f"n_envs must be 1 or more, got {n_envs}")
     return _envs(saved, n_envs, seed, training=True)
@@ -108,7 +111,12 @@ def _envs(saved: Saved, n_envs: int, seed: int, training: bool) -> VecEnv:
             vec_env_cls=DummyVecEnv,
         )
     if saved.vecnormalize is not None:
-        envs = VecNormalize.load(str(saved.vecnormalize), envs)
+        try:
+            envs = VecNormalize.load(str(saved.vecnormalize), envs)
+        except (AssertionError, AttributeError, EOFError, pickle.UnpicklingError) as error:
+            raise ConfigError(
+                f"{saved.vecnormalize} does not hold what VecNormalize saved for {env_id}: {error}"
+            ) from error
         envs.training = training
         envs.norm_reward = training and envs.norm_reward
     if settings.get("frame_stack"):

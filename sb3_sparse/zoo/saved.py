@@ -13,6 +13,7 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_sparse.errors import ConfigError, CorruptStateError
+from sb3_sparse.policies.saving import differ
 from sb3_sparse.zoo.experiment import load_for_prediction, saved_settings
 from sb3_sparse.zoo.run import algorithms
 
@@ -26,6 +27,7 @@ BY_POLICY = {
     "TD3Policy": "td3",
 }
 """Of the algorithms that have a policy class to themselves; DDPG is a TD3."""
+ON_POLICY = ("ppo", "a2c", "trpo")
 
 
 @dataclass(frozen=True)
@@ -96,14 +98,35 @@ def find_saved(
                 f"the run in {folder} normalised its observations, but {vecnormalize} is missing; "
                 "give the statistics with --vecnormalize FILE"
             )
+    algo = _algo(path, algo, arguments.get("algo"))
+    if vecnormalize is None and params is None and algo in ON_POLICY:
+        data, _ = read_zip(path)
+        if differ(data.get("_last_obs"), data.get("_last_original_obs")):
+            raise ConfigError(
+                f"{path} was trained on observations that a VecNormalize had normalised; give its "
+                "statistics with --vecnormalize FILE"
+            )
     if vecnormalize is not None and not vecnormalize.is_file():
         raise ConfigError(
             f"there is no file {vecnormalize}; give what VecNormalize.save wrote, e.g. "
             f"{VECNORMALIZE}"
         )
-    if algo is not None and algo not in algorithms():
-        raise ConfigError(f"unknown algorithm {algo!r}; allowed are {', '.join(algorithms())}")
-    return Saved(path, algo or arguments.get("algo") or algo_of(path), env_id, params, vecnormalize)
+    return Saved(path, algo, env_id, params, vecnormalize)
+
+
+def _algo(path: Path, given: str | None, known: str | None) -> str:
+    """The algorithm to load a zip by.
+
+    :raises ConfigError: if the one given is none, or not the file's
+    """
+    if given is None:
+        return known or algo_of(path)
+    if given not in algorithms():
+        raise ConfigError(f"unknown algorithm {given!r}; allowed are {', '.join(algorithms())}")
+    told = algo_of(path)
+    if given != told and {given, told} != {"td3", "ddpg"}:
+        raise ConfigError(f"{path} is a model of {told}, not of {given}; leave --algo out")
+    return given
 
 
 def algo_of(path: Path) -> str:
@@ -191,6 +214,10 @@ def arguments_of(folder: Path) -> dict[str, Any]:
     :raises ConfigError: if there is no run
     """
     files = list(folder.glob("*/args.yml"))
+    if not files and (folder / "compress.json").is_file():
+        raise ConfigError(
+            f"the compression in {folder} is not finished; give its command again, and it goes on"
+        )
     if len(files) != 1:
         raise ConfigError(
             f"there is no run in {folder}; give the run's own folder, e.g. "

@@ -267,3 +267,39 @@ def test_each_model_is_evaluated_with_its_own_normalisation(tmp_path):
     assert evaluation.obs_rms.count == model.get_vec_normalize_env().obs_rms.count > before + 64
     assert bench.returns(True, 0) == first
     assert evaluation.obs_rms.count == before
+
+
+def test_normalisation_of_rewards_alone(tmp_path):
+    env = VecNormalize(make_vec_env("CartPole-v1", n_envs=2, seed=0), norm_obs=False)
+    evaluation = make_vec_env("CartPole-v1", n_envs=2)
+    evaluation = VecNormalize(evaluation, training=False, norm_obs=False, norm_reward=False)
+    model = make("PPO", env=env, policy="MlpPolicy").learn(64)
+    outcome = compress(model, evaluation, tmp_path, sparsity=0.5, **QUICK)
+    assert outcome.sparsity["actor"] == 0.5
+    assert (tmp_path / "model" / "vecnormalize.pkl").is_file()
+
+
+def test_a_sparsity_that_leaves_layers_empty_is_refused(tmp_path):
+    # 4-24-24-2 has three layers, so at least 3 of 720 connections: 99.58 %
+    with pytest.raises(ConfigError, match=r"sparsity=0.9999 leaves less.*allowed is up to 0.9958"):
+        compress(trained(), cartpole(), tmp_path, sparsity=0.9999, **QUICK)
+
+
+def test_a_first_look_binds_nobody(tmp_path, monkeypatch):
+    model = trained()
+
+    def stop(model, steps):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(bench_module, "fine_tune", stop)
+        with pytest.raises(KeyboardInterrupt):
+            compress(model, cartpole(), tmp_path, sparsity=0.4, **QUICK)
+    other = {**QUICK, "episodes": 6}
+    outcome = compress(model, cartpole(), str(tmp_path), sparsity=0.4, **other)
+    assert outcome.episodes == 6
+    outcome.path.unlink()
+    with pytest.raises(CorruptStateError, match="is finished, but .*model.zip is missing"):
+        compress(model, cartpole(), tmp_path, sparsity=0.4, **other)
+    with pytest.raises(ConfigError, match="must be a VecEnv, got"):
+        compress(model, gym.make("CartPole-v1").env, tmp_path, sparsity=0.4, **other)

@@ -151,7 +151,8 @@ def test_an_interruption_anywhere_changes_nothing(breaks_at, tmp_path):
 
 
 def test_other_settings_and_a_damaged_file_are_named(tmp_path):
-    State({"steps": 10, "seed": 1, "max_drop": 0.03}).save(tmp_path)
+    level = Level(0.4, 10, "done", (1.0, 1.0), Interval(0, 0, 0))
+    State({"steps": 10, "seed": 1, "max_drop": 0.03}, levels=[level]).save(tmp_path)
     with pytest.raises(ConfigError, match=r"steps 10 instead of 20, max_drop 0.03 instead of None"):
         open_state(tmp_path, {"steps": 20, "seed": 1, "max_drop": None})
     (tmp_path / "compress.json").write_text('{"settings": {')

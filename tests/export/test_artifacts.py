@@ -47,9 +47,13 @@ def test_the_loader_is_short_and_needs_numpy_only():
 
 
 @pytest.mark.parametrize("blocked", [(), ("scipy",)], ids=["scipy", "numpy only"])
-@pytest.mark.parametrize("env", ["Pendulum-v1", TinyImages(False)], ids=["vectors", "images"])
-def test_the_loader_runs_with_and_without_scipy(env, blocked, tmp_path):
-    model = make("SAC", env, policy_kwargs=dict(sparsity=0.8))
+@pytest.mark.parametrize(
+    ("algorithm", "env"),
+    [("SAC", "Pendulum-v1"), ("SAC", TinyImages(False)), ("DQN", "CartPole-v1")],
+    ids=["vectors", "images", "discrete"],
+)
+def test_the_loader_runs_with_and_without_scipy(algorithm, env, blocked, tmp_path):
+    model = make(algorithm, env, policy_kwargs=dict(sparsity=0.8))
     export(model, tmp_path / "policy", "numpy")
     assert {path.name for path in tmp_path.iterdir()} == {"policy.npz", "numpy_policy.py"}
     model.observation_space.seed(0)

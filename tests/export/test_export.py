@@ -1,22 +1,29 @@
 """What is refused, and what is said."""
 
 import pickle
+import sys
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from export.tools import VECTOR, OddExtractor, Task
+from export.tools import VECTOR, OddExtractor, OwnExtractor, Task
 from gymnasium import spaces
 from sb3_contrib import RecurrentPPO
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3 import PPO
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 from support import make
+from torch import nn
 
+from sb3_sparse import SparseActorCriticPolicy
 from sb3_sparse.errors import ConfigError, CorruptStateError, UnsupportedError
 from sb3_sparse.export import ParityError, export, record_observations
 from sb3_sparse.export.artifact import compiled
 from sb3_sparse.export.extract import graph_of
 from sb3_sparse.export.parity import compare
+
+TORQUE = spaces.Box(-1, 1, (1,), np.float32)
 
 
 @pytest.fixture(scope="module")
@@ -248,3 +255,130 @@ def test_recorded_images_are_channels_first(tmp_path):
     found = record_observations(model, plain, 5)
     assert found.shape == (5, 1, 36, 36)
     assert export(model, tmp_path / "policy", observations=found).parity.recorded == 5
+
+
+def test_a_model_that_saw_normalised_observations_needs_the_statistics(tmp_path):
+    envs = VecNormalize(DummyVecEnv([lambda: gym.make("Pendulum-v1")]))
+    trained = make("PPO", envs)
+    trained.learn(40)
+    envs.save(str(tmp_path / "statistics.pkl"))
+    trained.save(tmp_path / "model.zip")
+    alone = type(trained).load(tmp_path / "model.zip")
+    with pytest.raises(ConfigError, match="a VecNormalize had normalised.*--vecnormalize FILE"):
+        export(alone, tmp_path / "policy")
+    report = export(alone, tmp_path / "policy", vecnormalize=tmp_path / "statistics.pkl")
+    assert report.parity.holds
+    plain = make("PPO")
+    plain.learn(40)
+    assert export(plain, tmp_path / "plain").parity.holds
+
+
+def test_frames_that_are_stacked_after_normalisation(tmp_path):
+    envs = VecFrameStack(VecNormalize(DummyVecEnv([lambda: gym.make("Pendulum-v1")])), 2)
+    model = make("PPO", envs)
+    with pytest.raises(ConfigError, match=r"shape \(3,\).*shape \(6,\).*'dense' only"):
+        export(model, tmp_path / "policy")
+    assert "does not normalise" in str(export(model, tmp_path / "policy", "dense"))
+
+
+def test_bounds_without_end_are_the_largest_floats_in_c(tmp_path):
+    model = normalised(clip_obs=np.inf)
+    for to in ("c", "numpy", "onnx"):
+        assert export(model, tmp_path / "policy", to).parity.holds
+    assert "3.4028235e+38f" in (tmp_path / "policy.c").read_text()
+
+
+def test_batch_normalisation_of_observations_far_from_zero(tmp_path):
+    model = make("CrossQ", Task(spaces.Box(999, 1001, (5,), np.float32), TORQUE))
+    norm = model.policy.actor.latent_pi[0]
+    norm.ra_mean.fill_(1000.0)
+    norm.ra_var.fill_(0.3)
+    for to in ("c", "numpy", "onnx"):
+        assert export(model, tmp_path / "policy", to).parity.difference < 1e-5
+
+
+class Scaled(OwnExtractor):
+    def forward(self, observations):
+        features = self.first(observations)
+        return th.add(features, self.second(features), alpha=0.5)
+
+
+class InPlace(OwnExtractor):
+    def forward(self, observations):
+        features = self.first(observations)
+        return features + nn.functional.relu(self.inplace(features))
+
+    def __init__(self, observation_space):
+        super().__init__(observation_space)
+        self.inplace = nn.ReLU(inplace=True)
+
+
+class Rows(OwnExtractor):
+    def __init__(self, observation_space):
+        super().__init__(observation_space)
+        self.rows = nn.Sequential(nn.Linear(5, 4), nn.Flatten())
+
+    def forward(self, observations):
+        return self.rows(observations)
+
+
+@pytest.mark.parametrize(
+    ("extractor", "shape", "message"),
+    [
+        (Scaled, (5,), "Scaled cannot be exported.*alpha"),
+        (InPlace, (5,), "changes a value in place.*build it with inplace=False"),
+        (Rows, (4, 5), r"of a value of shape \(4, 5\) cannot be exported"),
+    ],
+)
+def test_networks_that_would_be_misread_are_refused(extractor, shape, message, tmp_path):
+    env = Task(spaces.Box(-1, 1, shape, np.float32), spaces.Discrete(2))
+    model = make("PPO", env, policy_kwargs=dict(features_extractor_class=extractor))
+    with pytest.raises(UnsupportedError, match=message):
+        export(model, tmp_path / "policy")
+
+
+class OwnPolicy(ActorCriticPolicy):
+    pass
+
+
+class OwnSparsePolicy(SparseActorCriticPolicy):
+    pass
+
+
+def test_dense_zips_keep_policy_classes_of_ones_own(tmp_path):
+    export(PPO(OwnPolicy, "CartPole-v1", device="cpu"), tmp_path / "own", "dense")
+    assert type(PPO.load(tmp_path / "own.zip").policy) is OwnPolicy
+    model = PPO(OwnSparsePolicy, "CartPole-v1", device="cpu", policy_kwargs=dict(sparsity=0.5))
+    with pytest.raises(UnsupportedError, match="OwnSparsePolicy is a sparse policy of your own"):
+        export(model, tmp_path / "sparse", "dense")
+
+
+@pytest.mark.parametrize("tool", ["false", "cc -m32"])
+def test_a_compiler_that_is_no_use_is_named(model, tool, monkeypatch, tmp_path):
+    monkeypatch.setenv("CC", tool)
+    if tool != "false" and sys.maxsize < 2**32:
+        pytest.skip("a 32-bit machine")
+    with pytest.raises(UnsupportedError, match="in CC, or write it unchecked"):
+        export(model, tmp_path / "policy")
+    assert written(tmp_path) == []
+
+
+def test_all_files_are_written_or_none(model, tmp_path):
+    (tmp_path / "policy.h").mkdir()
+    with pytest.raises(ConfigError, match="policy.h is a folder"):
+        export(model, tmp_path / "policy.c")
+    assert written(tmp_path) == ["policy.h"]
+
+
+def test_broken_sensors_are_not_hidden(model, tmp_path):
+    export(model, tmp_path / "policy", "c")
+    act = compiled((tmp_path / "policy.c").read_text(), graph_of(model, None))
+    broken = np.full((1, 3), np.nan, np.float32)
+    used = model.policy.actor.latent_pi[0].state_dict()["weight"].any()
+    assert used
+    assert np.isnan(act(broken)).all()
+
+
+def test_recorded_observations_that_are_not_finite_are_refused(model, tmp_path):
+    with pytest.raises(ConfigError, match="must be finite"):
+        export(model, tmp_path / "policy", observations=np.full((2, 3), np.nan))

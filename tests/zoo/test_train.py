@@ -223,7 +223,7 @@ def test_two_processes_cannot_train_one_run(tmp_path):
 
     class Intrude(BaseCallback):
         def _on_training_start(self) -> None:
-            with pytest.raises(ConfigError, match="another process is training the run"):
+            with pytest.raises(ConfigError, match="another process is at work in"):
                 resume(stopped.folder)
 
         def _on_step(self) -> bool:
