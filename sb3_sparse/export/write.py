@@ -186,7 +186,7 @@ def normalization_of(
 ) -> VecNormalize | None:
     """What normalises a model's observations; None if nothing does.
 
-    :raises ConfigError: if the file has no such thing, or it is of other observations
+    :raises ConfigError: if the file has no such thing, or the statistics are missing
     """
     if given is None:
         given = model.get_vec_normalize_env()

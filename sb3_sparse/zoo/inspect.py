@@ -10,7 +10,7 @@ from sb3_sparse.engine.auto import Choice, choose
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.policies.mixin import SparsePolicyMixin
 from sb3_sparse.policies.report import SparsityReport
-from sb3_sparse.zoo.saved import arguments_of, model_in, read_zip, zip_path
+from sb3_sparse.zoo.saved import arguments_of, is_run, model_in, read_zip, zip_path
 from sb3_sparse.zoo.threads import use_few_threads
 
 
@@ -41,7 +41,9 @@ def _load(path: Path) -> tuple[SparsePolicyMixin, dict[str, Any]]:
 
     :raises ConfigError: if there is no such file, or no sparse policy in it
     """
-    path = model_in(path, arguments_of(path)["env"], False) if path.is_dir() else zip_path(path)
+    if is_run(path):
+        path = model_in(path, arguments_of(path)["env"], False)
+    path = zip_path(path)
     data, state = read_zip(path)
     policy_class = data.get("policy_class")
     if not (isinstance(policy_class, type) and issubclass(policy_class, SparsePolicyMixin)):

@@ -84,13 +84,14 @@ def find_saved(
     :param vecnormalize: statistics of a VecNormalize; None: those in the run's folder
     :raises ConfigError: if there is no model, or its statistics are missing
     """
+    if not is_run(path):
+        path = zip_path(path)
     folder = path if path.is_dir() else path.parent
-    arguments = arguments_of(folder) if path.is_dir() or _has_arguments(folder) else {}
+    arguments = arguments_of(folder) if path.is_dir() or is_run(folder) else {}
     env_id = env_id or arguments.get("env")
     params = _params_of(folder, arguments["env"]) if arguments else None
     if path.is_dir():
         path = model_in(folder, arguments["env"], best)
-    path = zip_path(path)
     if vecnormalize is None and params is not None and saved_settings(params).get("normalize"):
         vecnormalize = params / VECNORMALIZE
         if not vecnormalize.is_file():
@@ -228,7 +229,8 @@ def arguments_of(folder: Path) -> dict[str, Any]:
     return dict(arguments)
 
 
-def _has_arguments(folder: Path) -> bool:
+def is_run(folder: Path) -> bool:
+    """Whether a folder is that of a run."""
     return len(list(folder.glob("*/args.yml"))) == 1
 
 

@@ -173,7 +173,9 @@ def test_a_sampler_is_made_for_each_trial():
     [("none", 27, None), ("halving", 27, 3), ("hyperband", 27, 3)],
 )
 def test_pruners_let_a_bad_trial_go_on_to_their_first_rung(name, evaluations, at):
-    study = optuna.create_study(direction="maximize", pruner=pruner_of(name, evaluations))
+    # Hyperband puts trials into brackets by the study's name, which is random if none is given.
+    pruner = pruner_of(name, evaluations)
+    study = optuna.create_study(study_name="rungs", direction="maximize", pruner=pruner)
 
     def objective(trial):
         for step in range(1, evaluations + 1):
