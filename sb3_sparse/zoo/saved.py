@@ -169,8 +169,10 @@ def read_zip(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
 
 def zip_path(path: Path) -> Path:
     """The path with the suffix that SB3 adds, where it was left out."""
+    if not path.name or path.suffix:
+        return path
     with_suffix = path.with_suffix(".zip")
-    return with_suffix if not path.suffix and with_suffix.is_file() else path
+    return with_suffix if with_suffix.is_file() else path
 
 
 def check_masks(path: Path) -> None:
