@@ -6,10 +6,12 @@ import sys
 
 import numpy as np
 import pytest
+from sb3_contrib import RecurrentPPO
 from stable_baselines3.common.save_util import load_from_zip_file, save_to_zip_file
 from support import make
 
 from sb3_sparse import cli
+from sb3_sparse.errors import ConfigError
 from sb3_sparse.export.numpy_policy import Policy
 from sb3_sparse.zoo.run import Run
 from sb3_sparse.zoo.saved import algo_of, find_saved
@@ -108,7 +110,9 @@ def test_a_zip_of_a_normalised_run_alone_needs_its_statistics(
     for arguments in (["export", alone], ["compress", alone, "--env", "Pendulum-v1"]):
         code, said = command(monkeypatch, capsys, *arguments)
         assert code == 2
-        assert "give its statistics with --vecnormalize FILE" in said
+        assert (
+            "was trained under a VecNormalize; give its statistics with --vecnormalize FILE" in said
+        )
 
 
 def test_a_zip_alone(monkeypatch, capsys, tmp_path):
@@ -172,3 +176,9 @@ def test_mistakes_are_one_line(arguments, message, monkeypatch, capsys, tmp_path
 def test_a_file_tells_its_algorithm(algorithm, policy, tmp_path):
     make(algorithm, policy=policy).save(tmp_path / "model.zip")
     assert algo_of(tmp_path / "model.zip") == algorithm.lower()
+
+
+def test_a_recurrent_policy_is_not_taken_for_one_of_ppo(tmp_path):
+    RecurrentPPO("MlpLstmPolicy", "CartPole-v1", device="cpu").save(tmp_path / "model.zip")
+    with pytest.raises(ConfigError, match="belongs to no supported algorithm; allowed are dqn"):
+        algo_of(tmp_path / "model.zip")

@@ -177,10 +177,11 @@ def _settings(
             "make_vec_env"
         )
     check_eval_env(eval_env)
-    if (model.get_vec_normalize_env() is None) != (unwrap_vec_normalize(eval_env) is None):
+    both = (model.get_vec_normalize_env(), unwrap_vec_normalize(eval_env))
+    if len({None if env is None else env.norm_obs for env in both}) > 1:
         raise ConfigError(
             "the environments of training and evaluation must both be normalised by VecNormalize, "
-            "or neither"
+            "or neither, and both with norm_obs or without"
         )
     return {
         "model": fingerprint(model),

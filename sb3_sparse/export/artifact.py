@@ -141,7 +141,10 @@ def compiler() -> list[str]:
 
     :raises UnsupportedError: if there is none
     """
-    command = shlex.split(os.environ.get("CC", ""))
+    try:
+        command = shlex.split(os.environ.get("CC", ""))
+    except ValueError as error:
+        raise UnsupportedError(f"CC={os.environ['CC']!r} is no command: {error}") from error
     names = [command[0]] if command else list(COMPILERS)
     for name in names:
         found = shutil.which(name)

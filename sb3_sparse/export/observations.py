@@ -66,15 +66,27 @@ def _random(space: Any, rms: Any, count: int, generator: np.random.Generator) ->
 def record_observations(model: BaseAlgorithm, env: VecEnv, count: int) -> Observations:
     """Raw observations that a model meets in an environment, acting deterministically.
 
+    Where frames are stacked after they were normalised there are no raw observations of the
+    policy's shape; these are then what the policy sees.
+
     :param env: with the model's own wrappers, normalised or not; its statistics stay as they are
     :param count: how many
-    :raises ConfigError: if the environment shows other observations than the model takes
+    :raises ConfigError: if the environment shows other observations than the model takes, or takes
+        other actions
     """
     shown, taken = env.observation_space.shape, model.observation_space.shape
     if shown != taken and (shown is None or (*shown[2:], *shown[:2]) != taken):
         raise ConfigError(
             f"the environment shows observations of shape {shown}, the model takes {taken}; a "
             "run's folder tells which wrappers and stacked frames belong to it, a zip does not"
+        )
+    there, here = env.action_space, model.action_space
+    if type(there) is not type(here) or (
+        there.shape != here.shape if isinstance(here, spaces.Box) else there != here
+    ):
+        raise ConfigError(
+            f"the environment takes actions in {there}, the model chooses from {here}; give the "
+            "environment that it was trained in"
         )
     normalization = unwrap_vec_normalize(env)
     training = normalization is not None and normalization.training
@@ -84,7 +96,7 @@ def record_observations(model: BaseAlgorithm, env: VecEnv, count: int) -> Observ
     try:
         observation: Any = env.reset()
         for _ in range(-(-count // env.num_envs)):
-            found.append(observation if normalization is None else normalization.get_original_obs())
+            found.append(observation if normalization is None else _raw(normalization, observation))
             action, _ = model.predict(observation, deterministic=True)
             observation, _, _, _ = env.step(action)
     finally:
@@ -99,12 +111,19 @@ def record_observations(model: BaseAlgorithm, env: VecEnv, count: int) -> Observ
     return np.concatenate([maybe_transpose(part, space) for part in found])[:count]
 
 
+def _raw(normalization: VecNormalize, seen: Observations) -> Observations:
+    raw: Any = normalization.get_original_obs()
+    return seen if np.shape(raw) != np.shape(seen) else raw
+
+
 def check_recorded(observations: NDArray[Any], space: spaces.Space[Any]) -> None:
     """Refuse recorded observations that are not finite, or not of the policy's shape.
 
     :raises ConfigError: if so
     """
     shape = space.shape
+    if isinstance(observations, dict) != isinstance(space, spaces.Dict):
+        raise ConfigError(f"recorded observations must be of {space}, got {type(observations)}")
     if not isinstance(observations, dict) and shape != np.shape(observations)[1:]:
         raise ConfigError(
             f"recorded observations must have a row for each, of shape {shape} as the policy sees "

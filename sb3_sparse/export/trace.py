@@ -86,7 +86,7 @@ class Tracer:
         """
         shape = self.shape_of(value)
         if getattr(module, "inplace", False):
-            self.changed.add(value)
+            self.changed.update(self._sources(value))
         if type(module) in ACTIVATIONS:
             kind, slope = ACTIVATIONS[type(module)](module)
             return self.add(Activation((value,), shape, kind, slope))
@@ -138,6 +138,13 @@ class Tracer:
                 )
         return tuple(self.nodes)
 
+    def _sources(self, value: int) -> list[int]:
+        """A value, and what it is another view of."""
+        found = [value]
+        while found[-1] and isinstance(node := self.nodes[found[-1] - 1], Flatten):
+            found.append(node.inputs[0])
+        return found
+
     def _linear(self, module: nn.Linear, value: int) -> int:
         if len(self.shape_of(value)) != 1:
             raise UnsupportedError(
@@ -145,6 +152,11 @@ class Tracer:
                 "are vectors: flatten it before"
             )
         weight, bias = _arrays(module)
+        if weight.shape[1:] != self.shape_of(value):
+            raise UnsupportedError(
+                f"{module} gets {self.shape_of(value)[0]} features here; the policy does more than "
+                "its modules show and cannot be exported"
+            )
         return self.add(Linear((value,), (len(weight),), weight, bias))
 
     def _conv(self, module: nn.Conv2d, value: int) -> int:
@@ -181,9 +193,13 @@ class Tracer:
         centre = _array(getattr(module, mean)).astype(np.float64)
         deviation = np.sqrt(_array(getattr(module, var)).astype(np.float64) + module.eps)
         shape = self.shape_of(value)
-        if value == 0 and len(shape) == 1 and (np.abs(centre) > FAR * deviation).any():
+        if (
+            self._sources(value)[-1] == 0
+            and len(shape) == 1
+            and (np.abs(centre) > FAR * deviation).any()
+        ):
             # Folded into the layer behind, such terms would cancel out and leave few digits.
-            value = self.add(Normalize((0,), shape, centre, 1.0 / deviation, np.inf))
+            value = self.add(Normalize((value,), shape, centre, 1.0 / deviation, np.inf))
             centre, deviation = np.zeros_like(centre), np.ones_like(deviation)
         scale = np.ones_like(deviation)
         shift = np.zeros_like(deviation)
@@ -222,7 +238,7 @@ class Tracer:
             rest = [arg for arg in node.args if not isinstance(arg, fx.Node)]
             options = dict(node.kwargs)
             if options.pop("inplace", False) or target in IN_PLACE:
-                self.changed.add(values[0])
+                self.changed.update(self._sources(values[0]))
             plain = not options and not rest
             if target in FUNCTIONS and len(values) == 1 and plain:
                 return self.add(Activation((values[0],), shapes[0], FUNCTIONS[target]))

@@ -30,7 +30,7 @@ from sb3_sparse.export.observations import Observations, check_recorded, random_
 from sb3_sparse.export.parity import TOLERANCE, Parity, ParityError, compare
 from sb3_sparse.export.quantize import quantized
 from sb3_sparse.export.units import remove_dead_units, units_of
-from sb3_sparse.policies.saving import was_normalised
+from sb3_sparse.policies.saving import BROKEN_PICKLE, was_normalised
 
 FORMATS = ("c", "numpy", "onnx", "dense")
 RANDOM = 1000
@@ -119,12 +119,12 @@ def export(
     check_model(model)
     normalization, left_out = normalization_of(model, vecnormalize), False
     space = model.observation_space
-    if observations is not None:
-        check_recorded(observations, space)
     if normalization is not None and to == "dense":
         left_out, normalization = True, None  # which happens outside of the zip, as before
     elif normalization is not None:
         check_statistics(model, normalization)
+    if observations is not None:
+        check_recorded(observations, space)
     random = random_observations(
         space, normalization, RANDOM_IMAGES if is_image_space(space) else RANDOM
     )
@@ -192,9 +192,9 @@ def normalization_of(
         given = model.get_vec_normalize_env()
         if given is None and was_normalised(model):
             raise ConfigError(
-                "the model was trained on observations that a VecNormalize had normalised, and its "
-                "statistics are not here; give what VecNormalize.save wrote as vecnormalize "
-                "(--vecnormalize FILE)"
+                "the model was trained under a VecNormalize whose statistics are not here; give "
+                "what VecNormalize.save wrote as vecnormalize (--vecnormalize FILE), also if it "
+                "normalised rewards alone"
             )
     elif isinstance(given, (str, Path)):
         given = _read_normalization(Path(given))
@@ -222,7 +222,7 @@ def _read_normalization(path: Path) -> VecNormalize:
     try:
         with path.open("rb") as file:
             found = pickle.load(file)
-    except (OSError, pickle.UnpicklingError, EOFError) as error:
+    except (OSError, *BROKEN_PICKLE) as error:
         raise ConfigError(
             f"{path} cannot be read as statistics of a VecNormalize: {error}"
         ) from error

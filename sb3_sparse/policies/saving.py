@@ -3,12 +3,26 @@
 from __future__ import annotations
 
 import io
+import pickle
 from typing import Any
 
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.save_util import load_from_zip_file
+
+BROKEN_PICKLE = (
+    pickle.UnpicklingError,
+    EOFError,
+    ImportError,
+    AttributeError,
+    AssertionError,
+    ValueError,
+    IndexError,
+    TypeError,
+    KeyError,
+)
+"""What loading something else than a pickle of ours may raise."""
 
 
 def parts_of(model: BaseAlgorithm) -> tuple[dict[str, Any], dict[str, Any], Any]:
@@ -25,7 +39,7 @@ def parts_of(model: BaseAlgorithm) -> tuple[dict[str, Any], dict[str, Any], Any]
 
 
 def was_normalised(model: BaseAlgorithm) -> bool:
-    """Whether an on-policy model last saw an observation that a VecNormalize had changed.
+    """Whether an on-policy model was trained under a VecNormalize, as far as it remembers.
 
     Off-policy models do not tell.
     """

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ from stable_baselines3.common.vec_env import (
 )
 
 from sb3_sparse.errors import ConfigError, MissingExtra
+from sb3_sparse.policies.saving import BROKEN_PICKLE
 from sb3_sparse.zoo.environments import is_atari, known_environment
 from sb3_sparse.zoo.experiment import quiet, saved_settings
 from sb3_sparse.zoo.saved import Saved, arguments_of, read_zip
@@ -113,7 +113,7 @@ def _envs(saved: Saved, n_envs: int, seed: int, training: bool) -> VecEnv:
     if saved.vecnormalize is not None:
         try:
             envs = VecNormalize.load(str(saved.vecnormalize), envs)
-        except (AssertionError, AttributeError, EOFError, pickle.UnpicklingError) as error:
+        except BROKEN_PICKLE as error:
             raise ConfigError(
                 f"{saved.vecnormalize} does not hold what VecNormalize saved for {env_id}: {error}"
             ) from error

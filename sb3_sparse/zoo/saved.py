@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,8 @@ BY_POLICY = {
     "TD3Policy": "td3",
 }
 """Of the algorithms that have a policy class to themselves; DDPG is a TD3."""
+FOREIGN = ("Recurrent", "Maskable")
+"""Policies that inherit from PPO's and are of other algorithms."""
 ON_POLICY = ("ppo", "a2c", "trpo")
 
 
@@ -104,8 +107,8 @@ def find_saved(
         data, _ = read_zip(path)
         if differ(data.get("_last_obs"), data.get("_last_original_obs")):
             raise ConfigError(
-                f"{path} was trained on observations that a VecNormalize had normalised; give its "
-                "statistics with --vecnormalize FILE"
+                f"{path} was trained under a VecNormalize; give its statistics with --vecnormalize "
+                "FILE, also if it normalised rewards alone"
             )
     if vecnormalize is not None and not vecnormalize.is_file():
         raise ConfigError(
@@ -138,15 +141,16 @@ def algo_of(path: Path) -> str:
     data, _ = read_zip(path)
     policy = data.get("policy_class")
     names = [cls.__name__ for cls in policy.__mro__] if isinstance(policy, type) else []
+    foreign = any(name.startswith(FOREIGN) for name in names)
     for name, algo in BY_POLICY.items():
         if name in names:
             return algo
-    if "ActorCriticPolicy" in names:
+    if "ActorCriticPolicy" in names and not foreign:
         on_policy = {"clip_range": "ppo", "cg_max_steps": "trpo"}
         return next((algo for key, algo in on_policy.items() if key in data), "a2c")
     raise ConfigError(
         f"{path} has the policy {names[0] if names else policy!r}, which belongs to no supported "
-        f"algorithm; allowed are {', '.join(algorithms())}. If it is one of them, give --algo"
+        f"algorithm; allowed are {', '.join(algorithms())}"
     )
 
 
@@ -217,7 +221,10 @@ def arguments_of(folder: Path) -> dict[str, Any]:
     :raises ConfigError: if there is no run
     """
     files = list(folder.glob("*/args.yml"))
-    if not files and (folder / "compress.json").is_file():
+    compression = folder / "compress.json"
+    if not files and compression.is_file():
+        if json.loads(compression.read_text()).get("finished"):
+            raise ConfigError(f"{folder} is no run's folder; give the zip in it")
         raise ConfigError(
             f"the compression in {folder} is not finished; give its command again, and it goes on"
         )

@@ -91,6 +91,9 @@ def test_statistics_of_another_environment_are_refused(model, tmp_path):
     (tmp_path / "other.pkl").write_bytes(pickle.dumps([1]))
     with pytest.raises(ConfigError, match="holds list; give what VecNormalize.save wrote"):
         export(model, tmp_path / "policy", "c", vecnormalize=tmp_path / "other.pkl")
+    (tmp_path / "other.pkl").write_bytes(b"config: 1\nfoo\n")
+    with pytest.raises(ConfigError, match="cannot be read as statistics"):
+        export(model, tmp_path / "policy", "c", vecnormalize=tmp_path / "other.pkl")
     (tmp_path / "other.pkl").write_bytes(b"no pickle")
     with pytest.raises(ConfigError, match="cannot be read as statistics"):
         export(model, tmp_path / "policy", "c", vecnormalize=tmp_path / "other.pkl")
@@ -264,7 +267,7 @@ def test_a_model_that_saw_normalised_observations_needs_the_statistics(tmp_path)
     envs.save(str(tmp_path / "statistics.pkl"))
     trained.save(tmp_path / "model.zip")
     alone = type(trained).load(tmp_path / "model.zip")
-    with pytest.raises(ConfigError, match="a VecNormalize had normalised.*--vecnormalize FILE"):
+    with pytest.raises(ConfigError, match="under a VecNormalize.*--vecnormalize FILE"):
         export(alone, tmp_path / "policy")
     report = export(alone, tmp_path / "policy", vecnormalize=tmp_path / "statistics.pkl")
     assert report.parity.holds
@@ -278,7 +281,18 @@ def test_frames_that_are_stacked_after_normalisation(tmp_path):
     model = make("PPO", envs)
     with pytest.raises(ConfigError, match=r"shape \(3,\).*shape \(6,\).*'dense' only"):
         export(model, tmp_path / "policy")
-    assert "does not normalise" in str(export(model, tmp_path / "policy", "dense"))
+    seen = record_observations(model, envs, 20)
+    assert seen.shape == (20, 6)
+    report = export(model, tmp_path / "policy", "dense", observations=seen)
+    assert "does not normalise" in str(report)
+    with pytest.raises(ConfigError, match="'dense' only"):
+        export(model, tmp_path / "policy", observations=seen)
+
+
+def test_an_environment_of_other_actions_is_refused(model):
+    env = DummyVecEnv([lambda: Task(model.observation_space, spaces.Discrete(2))])
+    with pytest.raises(ConfigError, match=r"takes actions in Discrete\(2\), the model chooses"):
+        record_observations(model, env, 5)
 
 
 def test_bounds_without_end_are_the_largest_floats_in_c(tmp_path):
