@@ -44,6 +44,13 @@ ConfFile = Annotated[
 ]
 EvalFreq = Annotated[int | None, text("Steps between two evaluations.", shown="as the paper")]
 EvalEpisodes = Annotated[int | None, text("Episodes of an evaluation.", shown="as the paper")]
+Best = Annotated[bool, text("Of a run's folder, the best policy instead of the last.", "--best")]
+ModelAlgo = Annotated[str | None, text("Algorithm.", shown="as the run or the file")]
+ModelEnv = Annotated[str | None, text("Gymnasium environment id.", shown="as the run")]
+Statistics = Annotated[
+    Path | None,
+    text("Statistics saved by VecNormalize.", "--vecnormalize", shown="those of the run"),
+]
 Device = Annotated[str, text("auto, cpu or cuda.")]
 LogFolder = Annotated[Path, text("Where folders are made.", "--log-folder", "-f")]
 

@@ -9,7 +9,15 @@ from typing import Annotated
 
 import typer
 
-from sb3_sparse.cli.common import INTERRUPTED, console, text
+from sb3_sparse.cli.common import (
+    INTERRUPTED,
+    Best,
+    ModelAlgo,
+    ModelEnv,
+    Statistics,
+    console,
+    text,
+)
 
 
 def compress(
@@ -28,12 +36,10 @@ def compress(
     distribution: Annotated[
         str | None, text("erk, er or uniform.", shown="a sparse model's own, else erk")
     ] = None,
-    env: Annotated[str | None, text("Gymnasium environment id.", shown="as the run")] = None,
-    algo: Annotated[str | None, text("Algorithm.", shown="as the run or the file")] = None,
-    vecnormalize: Annotated[
-        Path | None, text("Statistics saved by VecNormalize.", shown="those of the run")
-    ] = None,
-    best: Annotated[bool, text("The run's best policy instead of the last.", "--best")] = False,
+    env: ModelEnv = None,
+    algo: ModelAlgo = None,
+    vecnormalize: Statistics = None,
+    best: Best = False,
     steps: Annotated[
         int | None,
         text("Environment steps of each fine-tuning.", shown="5% of the model's, 10000 or more"),

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from sb3_sparse.cli.common import console, text
+from sb3_sparse.cli.common import Best, ModelAlgo, ModelEnv, Statistics, console, text
 from sb3_sparse.errors import ConfigError
 
 RECORDED = 1000
@@ -20,22 +20,19 @@ def export(
         Path, typer.Argument(help="The file to write; its suffix may be left out.")
     ] = Path("policy"),
     to: Annotated[str, text("c, numpy, onnx or dense (a zip of stock SB3).", "--to")] = "c",
-    vecnormalize: Annotated[
-        Path | None,
-        text("Statistics that VecNormalize saved.", shown="those in the run's folder"),
-    ] = None,
+    vecnormalize: Statistics = None,
     int8: Annotated[
         bool, text("C only: weights as 8-bit numbers with a scale for each row.", "--int8")
     ] = False,
-    best: Annotated[bool, text("The best policy instead of the last.", "--best")] = False,
-    env: Annotated[
-        str | None,
-        text("Environment to record observations in.", shown="the one of the run"),
-    ] = None,
-    algo: Annotated[str | None, text("Algorithm.", shown="told from the file")] = None,
+    best: Best = False,
+    env: ModelEnv = None,
+    algo: ModelAlgo = None,
     force: Annotated[bool, text("Write also what does not act as the model.", "--force")] = False,
 ) -> None:
-    """Write a policy as C, NumPy or ONNX, or as a dense zip, and check that it acts the same."""
+    """Write a policy as C, NumPy or ONNX, or as a dense zip, and check that it acts the same.
+
+    Observations to check with are recorded in the environment, if it is known.
+    """
     from sb3_sparse.export import FORMATS, record_observations
     from sb3_sparse.export import export as write
     from sb3_sparse.zoo.finetune import evaluation_envs

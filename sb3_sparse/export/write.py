@@ -13,6 +13,7 @@ from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import VecNormalize
+from torch import nn
 
 from sb3_sparse.errors import ConfigError, MissingExtra, UnsupportedError
 from sb3_sparse.export.artifact import (
@@ -44,9 +45,10 @@ class ExportReport:
     :param files: with their sizes in bytes
     :param parity: how far it is from the model; None: not run
     :param rounding: what 8-bit weights change in the actions; None: weights are float32
-    :param dense_bytes: float32 weights and biases of the dense network that acts
-    :param nnz: connections of the policy that are not 0
-    :param exported_nnz: those that are left without dead units; None for ``"dense"``
+    :param dense_bytes: float32 weights and biases of the dense network that acts; 0 for
+        ``"dense"``, as the counts of units
+    :param nnz: connections of the network that acts that are not 0; for ``"dense"``, of all
+    :param exported_nnz: those that are left without dead units
     :param removed_units: dead units
     :param units: units before
     :param sizes: bytes that it takes where it runs, by kind (``"flash"``, ``"RAM"``)
@@ -73,6 +75,8 @@ class ExportReport:
                 f"connections: {self.nnz:,}, exported {self.exported_nnz:,}; "
                 f"{self.removed_units} of {self.units} units were dead and are left out"
             )
+        else:
+            lines.append(f"connections that are not 0: {self.nnz:,}")
         lines.append(f"parity: {'not checked' if self.parity is None else self.parity}")
         if self.rounding is not None:
             lines.append(f"8-bit weights against float32: {self.rounding}")
@@ -132,6 +136,7 @@ def export(
     raw = small = Graph(())
     if to == "dense":
         artifact = dense_artifact(model, left_out)
+        nnz = exported_nnz = _connections(model)
     else:
         raw = graph_of(model, normalization)
         small = remove_dead_units(fold(raw))
@@ -142,6 +147,7 @@ def export(
             if to == "numpy"
             else onnx_artifact(small, made_by)
         )
+        nnz, exported_nnz = raw.nnz, small.nnz
     suffix = next(iter(artifact.files))
     main = _main_file(Path(path), suffix)
     discrete = not isinstance(model.action_space, spaces.Box)
@@ -172,8 +178,8 @@ def export(
         parity=parity,
         rounding=rounding,
         dense_bytes=sum(4 * (layer.weight.size + layer.bias.size) for layer in raw.layers),
-        nnz=raw.nnz,
-        exported_nnz=small.nnz,
+        nnz=nnz,
+        exported_nnz=exported_nnz,
         removed_units=units_of(raw) - units_of(small),
         units=units_of(raw),
         sizes=artifact.sizes,
@@ -229,6 +235,16 @@ def _read_normalization(path: Path) -> VecNormalize:
     if not isinstance(found, VecNormalize):
         raise ConfigError(f"{path} holds {type(found).__name__}; give what VecNormalize.save wrote")
     return found
+
+
+def _connections(model: BaseAlgorithm) -> int:
+    """Connections of all layers that are not 0, targets left out and shared layers once."""
+    layers = [
+        module
+        for name, module in model.policy.named_modules()
+        if isinstance(module, (nn.Linear, nn.Conv2d)) and "target" not in name
+    ]
+    return sum(int(layer.weight.count_nonzero()) for layer in layers)
 
 
 def _main_file(path: Path, suffix: str) -> Path:

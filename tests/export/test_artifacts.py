@@ -115,7 +115,8 @@ def test_dense_zips_go_on_training_without_this_package(tmp_path):
 def test_a_dense_zip_keeps_each_moment_with_its_weight(tmp_path):
     model = make("SAC", policy_kwargs=dict(compute="sparse"))
     model.learn(60)
-    export(model, tmp_path / "dense", "dense")
+    report = export(model, tmp_path / "dense", "dense")
+    assert report.nnz == sum(int(layer.mask().sum()) for layer in model.policy.sparse.layers)
     stock = type(model).load(tmp_path / "dense.zip")
     sparse = dict(model.policy.actor.named_parameters())
     checked = 0
