@@ -173,6 +173,17 @@ def locked(folder: Path) -> Iterator[None]:
         lock.release()
 
 
+def is_locked(folder: Path) -> bool:
+    """Whether some process trains the run now."""
+    if not (folder / ".lock").is_file():
+        return False
+    try:
+        with locked(folder):
+            return False
+    except ConfigError:
+        return True
+
+
 def clear_checkpoints(folder: Path) -> None:
     """Remove what only an interrupted run needs."""
     shutil.rmtree(folder / FOLDER, ignore_errors=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from copy import deepcopy
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -51,15 +52,25 @@ def read_yaml(path: Path, what: str = "environment ids to settings") -> dict[str
     :param what: it maps, for the message
     :raises ConfigError: if there is no such file, or no mapping in it
     """
+    return deepcopy(_read(path, what))
+
+
+def _read(path: Path, what: str = "environment ids to settings") -> dict[str, Any]:
     if not path.is_file():
         raise ConfigError(f"there is no config file {path}")
     try:
-        content = yaml.safe_load(path.read_text())
+        content = _parsed(path.read_text())
     except yaml.YAMLError as error:
         raise ConfigError(f"{path} is no valid YAML: {error}") from error
     if not isinstance(content, dict):
         raise ConfigError(f"{path} must map {what}, got {content!r}")
     return content
+
+
+@lru_cache(maxsize=64)
+def _parsed(text: str) -> Any:
+    """What a text says; once, since a study asks for the same files thousands of times."""
+    return yaml.safe_load(text)
 
 
 def entry_of(path: Path, env_id: str, atari: bool) -> dict[str, Any]:
@@ -70,7 +81,7 @@ def entry_of(path: Path, env_id: str, atari: bool) -> dict[str, Any]:
     :param atari: whether it is an Atari game, which ``atari`` serves
     :raises ConfigError: if the file has nothing for this environment
     """
-    content = read_yaml(path)
+    content = _read(path)
     shared = "atari" if atari else "default"
     key = env_id if env_id in content else shared
     if key not in content:
@@ -87,6 +98,6 @@ def entry_of(path: Path, env_id: str, atari: bool) -> dict[str, Any]:
 
 def evaluation_of(algo: str, env_id: str, atari: bool) -> dict[str, int]:
     """How a run is evaluated: ``eval_freq`` (environment steps) and ``eval_episodes``."""
-    suite = read_yaml(config_root() / "evaluation.yml")[algo]
+    suite = _read(config_root() / "evaluation.yml")[algo]
     shared = "atari" if atari else "default"
     return {name: int(value) for name, value in suite.get(env_id, suite[shared]).items()}

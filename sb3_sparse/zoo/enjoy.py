@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import VecVideoRecorder
 
 from sb3_sparse.errors import ConfigError, MissingExtra
 from sb3_sparse.zoo.environments import is_atari, known_environment
-from sb3_sparse.zoo.experiment import load_for_prediction, quiet, test_env
+from sb3_sparse.zoo.experiment import envs_of_run, load_for_prediction, quiet
 from sb3_sparse.zoo.saved import arguments_of, model_in
 
 VIDEO_STEPS = 1000
@@ -67,7 +67,7 @@ def enjoy(
     if video:
         env_kwargs["render_mode"] = "rgb_array"
     with quiet():
-        env = test_env(env_id, folder / env_name, env_kwargs, seed)
+        env = envs_of_run(env_id, folder / env_name, env_kwargs, seed)
         model = load_for_prediction(algo, path)
         if video:
             env = VecVideoRecorder(

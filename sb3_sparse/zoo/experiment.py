@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 from argparse import Namespace
 from collections import OrderedDict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout
 from copy import deepcopy
 from pathlib import Path
@@ -151,14 +151,28 @@ def spaces_of(
     return envs.observation_space, envs.action_space
 
 
-def test_env(env_id: str, params: Path, env_kwargs: dict[str, Any], seed: int) -> VecEnv:
-    """One environment with the wrappers, stacking and normalisation of a finished run.
+def envs_of_run(
+    env_id: str,
+    params: Path,
+    env_kwargs: dict[str, Any],
+    seed: int,
+    n_envs: int = 1,
+    wrappers: Sequence[Mapping[str, Any]] = (),
+) -> VecEnv:
+    """Environments with the wrappers, stacking and normalisation of a finished run.
 
     :param params: folder of the run's ``config.yml`` and normalisation
+    :param n_envs: how many side by side
+    :param wrappers: further ones, around those of the run but below stacking and normalisation;
+        each a path to its arguments, as in rl-zoo's ``env_wrapper``
     """
     hyperparams, stats = get_saved_hyperparams(str(params))
+    if wrappers:
+        own = hyperparams.get("env_wrapper") or []
+        hyperparams["env_wrapper"] = [*(own if isinstance(own, list) else [own]), *wrappers]
     env: VecEnv = create_test_env(
         env_id,
+        n_envs=n_envs,
         stats_path=stats,
         seed=seed,
         should_render=False,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +14,18 @@ from gymnasium import spaces
 
 from sb3_sparse.errors import ConfigError, MissingExtra, SparsityError
 from sb3_sparse.zoo.experiment import spaces_of
+from sb3_sparse.zoo.match import Match, match_parameters, untrained_policy
+from sb3_sparse.zoo.record import sparsity_of, versions, write_record
 from sb3_sparse.zoo.run import Run
+from sb3_sparse.zoo.settings import method_of
 
 
 @dataclass(frozen=True)
 class Prepared:
     """What is known of a run before it is trained.
 
-    :param settings: as it shall be trained
+    :param settings: as it shall be trained; widths of a dense network that matches a sparse one's
+        parameters are in it
     :param evaluation: ``eval_freq`` and ``eval_episodes``
     :param observation_space: that the policy sees, wrappers and stacking included
     :param action_space: that it acts in
@@ -31,6 +35,19 @@ class Prepared:
     evaluation: dict[str, int]
     observation_space: spaces.Space[Any]
     action_space: spaces.Space[Any]
+    match: Match | None
+
+    def record(self, run: Run) -> dict[str, Any]:
+        """What ``sparsity.json`` says of the run from its start."""
+        match = {} if self.match is None else {"match": asdict(self.match)}
+        return {
+            "method": method_of(self.settings),
+            "run": run.as_dict(),
+            "settings": self.settings,
+            "evaluation": self.evaluation,
+            "versions": versions(),
+            **match,
+        }
 
 
 def prepare(run: Run, log_folder: Path) -> Prepared:
@@ -47,7 +64,27 @@ def prepare(run: Run, log_folder: Path) -> Prepared:
             run, settings, log_folder / run.algo / "new", evaluation
         )
     check_action_space(run, action_space)
-    return Prepared(settings, evaluation, observation_space, action_space)
+    match = None
+    if run.match_params is not None:
+        match = match_parameters(
+            run.algorithm, observation_space, action_space, settings, run.match_params
+        )
+        settings["policy_kwargs"] = match.policy_kwargs
+    return Prepared(settings, evaluation, observation_space, action_space, match)
+
+
+def count(run: Run, folder: Path) -> None:
+    """Record what a run's networks would hold and cost, in a folder of its own; no training.
+
+    :param folder: as of :func:`sb3_sparse.zoo.train.train`
+    :raises ConfigError: as :func:`prepare`
+    """
+    prepared = prepare(run, folder.parent.parent)
+    policy = untrained_policy(
+        run.algorithm, prepared.observation_space, prepared.action_space, prepared.settings
+    )
+    folder.mkdir(parents=True, exist_ok=True)
+    write_record(folder, status="counted", **prepared.record(run), **sparsity_of(policy))
 
 
 def doubt(run: Run) -> str:

@@ -7,7 +7,6 @@ import shutil
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
@@ -24,13 +23,11 @@ from sb3_sparse.zoo.checkpoint import (
 )
 from sb3_sparse.zoo.evaluation import Evaluation
 from sb3_sparse.zoo.experiment import Experiment, spaces_of
-from sb3_sparse.zoo.match import match_parameters
 from sb3_sparse.zoo.prepare import doubt, explained, prepare
-from sb3_sparse.zoo.record import read_record, sparsity_of, versions, write_record
+from sb3_sparse.zoo.record import read_record, sparsity_of, write_record
 from sb3_sparse.zoo.results import Outcome, final_results
 from sb3_sparse.zoo.run import Run
-from sb3_sparse.zoo.settings import method_of
-from sb3_sparse.zoo.threads import use_few_threads
+from sb3_sparse.zoo.speed import compute_fast
 
 EVALUATION_ENVS = 10
 
@@ -41,6 +38,7 @@ def train(
     callbacks: Sequence[BaseCallback] = (),
     tensorboard_log: str = "",
     after_evaluation: BaseCallback | None = None,
+    folder: Path | None = None,
 ) -> Outcome:
     """Train anew in ``log_folder/<algo>/<env>_<number>``.
 
@@ -49,6 +47,8 @@ def train(
     :param callbacks: further callbacks
     :param tensorboard_log: where TensorBoard's files go; empty: none
     :param after_evaluation: called after each evaluation; the evaluation is its ``parent``
+    :param folder: the run's own folder, ``.../<algo>/<name>``, in place of the next free number in
+        ``log_folder``; nothing else may be in it
     :raises ConfigError: if the environment cannot be made or the algorithm cannot act in it
     """
     if tensorboard_log and importlib.util.find_spec("tensorboard") is None:
@@ -57,30 +57,17 @@ def train(
         tensorboard_log = str(Path(tensorboard_log).absolute())  # also after a resume elsewhere
     prepared = prepare(run, log_folder)
     settings, evaluation = prepared.settings, prepared.evaluation
-    use_few_threads(prepared.observation_space)
-    record: dict[str, Any] = {}
-    if run.match_params is not None:
-        match = match_parameters(
-            run.algorithm,
-            prepared.observation_space,
-            prepared.action_space,
-            settings,
-            run.match_params,
-        )
-        settings["policy_kwargs"] = match.policy_kwargs
-        record["match"] = asdict(match)
-    folder = new_run_folder(log_folder / run.algo, run.env_id.replace("/", "-"))
+    compute_fast(prepared.observation_space)
+    if folder is None:
+        folder = new_run_folder(log_folder / run.algo, run.env_id.replace("/", "-"))
+    else:
+        folder.mkdir(parents=True, exist_ok=True)
     with locked(folder):
         write_record(
             folder,
             status="running",
-            method=method_of(settings),
-            run=run.as_dict(),
-            settings=settings,
-            evaluation=evaluation,
+            **prepared.record(run),
             tensorboard_log=tensorboard_log,
-            versions=versions(),
-            **record,
         )
         model = None
         try:
@@ -116,7 +103,7 @@ def resume(folder: Path, callbacks: Sequence[BaseCallback] = ()) -> Outcome:
         start = folder if record.get("trained") else last_checkpoint(folder)
         with explained(f"the run in {folder} cannot go on from {start or 'its start'}", run.env_id):
             observation_space, _ = spaces_of(run, settings, folder, evaluation)
-            use_few_threads(observation_space)
+            compute_fast(observation_space)
             if start != folder:
                 restore_monitors(folder, start)
             experiment = Experiment(
