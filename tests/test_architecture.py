@@ -41,7 +41,7 @@ EDGES = {
     "rliable": {"report"},
     "onnx": {"export"},
     "onnxruntime": {"export"},
-    "scipy": {"compress", "export"},
+    "scipy": {"compress", "export", "report"},
     "ray": {"launch"},
     "sqlalchemy": {"tuning"},
     "plotly": {"tuning"},

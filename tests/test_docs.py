@@ -64,6 +64,34 @@ def test_the_compact_model_of_the_documents_trains():
     names["model"].learn(110)
 
 
+def test_the_measures_of_the_documents_run(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    code = "".join(python_blocks("docs/analysis.md"))
+    changes = {
+        "1_000_000": "150",
+        "10_000": "50",
+        "1_000": "50",
+        '"HalfCheetah-v5"': '"Pendulum-v1"',
+        "np.zeros(17)": "np.zeros(3)",
+        "feature_std(model, clean)": "feature_std(model, clean, 200)",
+        "[0, 0.1, 0.2, 0.5, 1]": "[0, 1]",
+        "n_envs=10": "n_envs=5",
+        "seeds=(0, 1)": "n_episodes=5",
+    }
+    for old, new in changes.items():
+        assert old in code
+        code = code.replace(old, new)
+    exec(compile(code, "docs/analysis.md", "exec"), {})
+    said = capsys.readouterr().out
+    assert "gradient step of SAC" in said
+    assert "DormantShare" in said
+    assert {path.name for path in (tmp_path / "run").iterdir()} == {
+        "snr.csv",
+        "plasticity.csv",
+        "plasticity.masks.npz",
+    }
+
+
 @pytest.mark.parametrize("path", ["README.md", *(f"docs/{p.name}" for p in ROOT.glob("docs/*.md"))])
 def test_links_lead_somewhere(path):
     text = (ROOT / path).read_text()

@@ -13,6 +13,7 @@ try:
     from sb3_sparse.cli.compress import compress
     from sb3_sparse.cli.export import export
     from sb3_sparse.cli.look import enjoy, inspect
+    from sb3_sparse.cli.study import studies
     from sb3_sparse.cli.train import train
     from sb3_sparse.cli.tune import tuning
 except ImportError as error:
@@ -32,6 +33,7 @@ app.command()(inspect)
 app.command()(compress)
 app.command()(export)
 app.add_typer(tuning, name="tune")
+app.add_typer(studies, name="study", help="Run and report whole comparisons, as the paper's.")
 
 
 def main() -> None:

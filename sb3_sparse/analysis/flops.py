@@ -1,0 +1,223 @@
+"""Floating-point operations of policies, sparse or stock, acting and training."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from types import SimpleNamespace
+from typing import Any
+
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+
+from sb3_sparse.analysis.networks import kernels_of, modules_of, specs_of
+from sb3_sparse.analysis.passes import Pass, batch_size_of, passes_of
+from sb3_sparse.engine.network import SparseNetwork
+from sb3_sparse.errors import ConfigError
+from sb3_sparse.policies.mixin import SparsePolicyMixin
+from sb3_sparse.policies.report import LayerReport, SparsityReport, report_on
+
+
+@dataclass(frozen=True)
+class LayerFlops:
+    """FLOPs of one layer.
+
+    :param network: name of the network that it belongs to
+    :param name: dotted name within the policy
+    :param shape: weight shape, torch order
+    :param nnz: active connections
+    :param forward: of a forward pass at batch 1
+    :param dense_forward: the same for the dense layer
+    :param step: of a gradient step, with the whole minibatch; None: only a policy was given
+    :param dense_step: the same for the dense layer
+    """
+
+    network: str
+    name: str
+    shape: tuple[int, ...]
+    nnz: int
+    forward: int
+    dense_forward: int
+    step: float | None
+    dense_step: float | None
+
+
+@dataclass(frozen=True)
+class FlopsReport:
+    """FLOPs of all layers; ``print`` it for a table.
+
+    :param layers: every layer once, targets not apart
+    :param algorithm: whose gradient step was counted; None: none was
+    :param batch_size: samples of its minibatch
+    :param passes: how often it runs each network
+    """
+
+    layers: tuple[LayerFlops, ...]
+    algorithm: str | None = None
+    batch_size: int | None = None
+    passes: tuple[Pass, ...] = ()
+
+    @property
+    def networks(self) -> tuple[str, ...]:
+        """Names of the networks."""
+        return tuple(dict.fromkeys(layer.network for layer in self.layers))
+
+    def forward(self, network: str | None = None) -> int:
+        """Of one forward pass at batch 1, of one network or of all."""
+        return sum(layer.forward for layer in self._of(network))
+
+    def dense_forward(self, network: str | None = None) -> int:
+        """The same without sparsity."""
+        return sum(layer.dense_forward for layer in self._of(network))
+
+    def step(self, network: str | None = None) -> float:
+        """Of one gradient step, of one network or of all.
+
+        :raises ConfigError: if only a policy was given, which has no gradient steps
+        """
+        return sum(self._counted(layer.step) for layer in self._of(network))
+
+    def dense_step(self, network: str | None = None) -> float:
+        """The same without sparsity.
+
+        :raises ConfigError: if only a policy was given
+        """
+        return sum(self._counted(layer.dense_step) for layer in self._of(network))
+
+    def _of(self, network: str | None) -> list[LayerFlops]:
+        if network not in (None, *self.networks):
+            raise ConfigError(f"no network {network!r}; there are {', '.join(self.networks)}")
+        return [layer for layer in self.layers if network in (None, layer.network)]
+
+    @staticmethod
+    def _counted(step: float | None) -> float:
+        if step is None:
+            raise ConfigError("a policy alone has no gradient step; call flops with the model")
+        return step
+
+    def __str__(self) -> str:
+        heads = ["layer", "shape", "forward", "of dense"]
+        rows = [
+            [r.name, "x".join(map(str, r.shape)), *_share(r.forward, r.dense_forward)]
+            for r in self.layers
+        ]
+        ends: list[str | None] = [*self.networks, None]
+        rows += [
+            [name or "total", "", *_share(self.forward(name), self.dense_forward(name))]
+            for name in ends
+        ]
+        if self.algorithm is not None:
+            heads += ["gradient step", "of dense"]
+            steps = [(r.step or 0.0, r.dense_step or 0.0) for r in self.layers]
+            steps += [(self.step(name), self.dense_step(name)) for name in ends]
+            rows = [row + _share(*step) for row, step in zip(rows, steps, strict=True)]
+        widths = [max(map(len, column)) for column in zip(heads, *rows, strict=True)]
+        lines = [
+            "  ".join(
+                cell.ljust(width) if i < 2 else cell.rjust(width)
+                for i, (cell, width) in enumerate(zip(row, widths, strict=True))
+            )
+            for row in (heads, *rows)
+        ]
+        note = "FLOPs, forward at batch 1"
+        if self.algorithm is not None:
+            note += f"; gradient step of {self.algorithm} at batch {self.batch_size}"
+        return "\n".join([*lines, note])
+
+
+def _share(flops: float, dense: float) -> list[str]:
+    return [f"{flops:,.0f}", f"{flops / dense:.3f}" if dense else "-"]
+
+
+def flops(
+    policy_or_model: BasePolicy | BaseAlgorithm, batch_size: int | None = None
+) -> FlopsReport:
+    """Count the FLOPs of any SB3 policy, and of a gradient step if a model is given.
+
+    A multiply-add counts 2; biases and activations 1 each. What is sparse is counted by its active
+    connections for each output position, as if zeros cost nothing.
+
+    A gradient step counts, for each sample of the minibatch: 1 for a forward pass; 2 for a backward
+    pass of what is trained; target networks forward only; 1 for handing a gradient on to the actor
+    through a critic (stock SB3 computes the critic's weight gradients there too and throws them
+    away, which is not counted). How often each network runs is in
+    :mod:`sb3_sparse.analysis.passes`; delays and minibatch are the model's. Optimizers, averaging
+    of targets, normalisation layers, losses and RigL's dense gradients are not counted.
+
+    :param policy_or_model: sparse or stock, with any features extractor of Linear and Conv layers
+    :param batch_size: samples of a gradient step; None: the model's
+    :raises UnsupportedError: for a policy whose networks are not known
+    :raises ConfigError: for a model whose algorithm's steps are not known, or a batch size without
+        a model
+
+    Source: arXiv:2206.10369; a step of three forward passes where all is trained as in
+    arXiv:1911.11134.
+    """
+    if isinstance(policy_or_model, BasePolicy):
+        if batch_size is not None:
+            raise ConfigError("batch_size means nothing for a policy; call flops with the model")
+        return FlopsReport(tuple(_layer(r, None) for r in _report(policy_or_model).layers))
+    model = policy_or_model
+    passes = passes_of(model)
+    size = batch_size_of(model) if batch_size is None else batch_size
+    if isinstance(size, bool) or not isinstance(size, int) or size < 1:
+        raise ConfigError(f"batch_size must be an integer, 1 or more, got {size!r}")
+    policy = model.policy
+    times = _times(policy, passes)
+    layers = tuple(_layer(r, size * times[r.name]) for r in _report(policy).layers)
+    return FlopsReport(layers, type(model).__name__, size, tuple(passes))
+
+
+def _layer(r: LayerReport, times: float | None) -> LayerFlops:
+    step = None if times is None else times * r.flops
+    dense = None if times is None else times * r.dense_flops
+    return LayerFlops(r.network, r.name, r.shape, r.nnz, r.flops, r.dense_flops, step, dense)
+
+
+def _report(policy: BasePolicy) -> SparsityReport:
+    """The sparsity report; of a stock policy that of a policy with all of its layers left dense."""
+    if isinstance(policy, SparsePolicyMixin):
+        return policy.sparsity_report()
+    networks = [
+        SparseNetwork(name, policy, [], list(kernels.items()))
+        for name, kernels in _owned(policy).items()
+    ]
+    dense: Any = SimpleNamespace(
+        sparse=SimpleNamespace(networks=networks),
+        modules=policy.modules,
+        observation_space=policy.observation_space,
+        device=policy.device,
+        normalize_images=policy.normalize_images,
+    )
+    return report_on(dense)
+
+
+def _owned(policy: BasePolicy) -> dict[str, dict[str, Any]]:
+    """Layers by network; one that several run belongs to the first."""
+    seen: set[int] = set()
+    found: dict[str, dict[str, Any]] = {}
+    for network, spec in specs_of(policy).items():
+        kernels = kernels_of(policy, spec)
+        found[network] = {n: m for n, m in kernels.items() if id(m) not in seen}
+        seen.update(map(id, kernels.values()))
+    return found
+
+
+def _times(policy: BasePolicy, passes: list[Pass]) -> dict[str, float]:
+    """Forward passes that a layer's work in one gradient step amounts to, for each sample."""
+    specs, owned = specs_of(policy), _owned(policy)
+    names = {id(m): name for kernels in owned.values() for name, m in kernels.items()}
+    times = dict.fromkeys(names.values(), 0.0)
+    for one in passes:
+        modules = modules_of(policy, specs[one.network])
+        extractors = [m for m in modules.values() if isinstance(m, BaseFeaturesExtractor)]
+        before_actions = {id(m) for extractor in extractors for m in extractor.modules()}
+        for name, module in kernels_of(policy, specs[one.network]).items():
+            own = name in owned[one.network]
+            if fnmatchcase(name, one.leaves_out) or not (own or one.shares):
+                continue
+            through = 0.0 if id(module) in before_actions else one.through
+            backward = 2 * one.backward if own else 0.0
+            times[names[id(module)]] += one.forward + backward + through
+    return times

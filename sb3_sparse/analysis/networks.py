@@ -1,0 +1,131 @@
+"""The networks of any SB3 policy, sparse or stock, under the same names."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from typing import Any
+
+import torch as th
+from numpy.typing import NDArray
+from stable_baselines3.common.policies import BasePolicy
+from torch import nn
+
+from sb3_sparse.engine.controller import Controller
+from sb3_sparse.engine.kernels import KERNEL_TYPES, UNSUPPORTED_TYPES, Kernel
+from sb3_sparse.engine.linear import CompactLinear
+from sb3_sparse.engine.sequential import ChainedSequential
+from sb3_sparse.errors import UnsupportedError
+from sb3_sparse.policies.aliases import supported_algorithms
+from sb3_sparse.policies.mixin import SparsePolicyMixin
+from sb3_sparse.policies.spec import NetworkSpec
+
+
+def specs_of(policy: BasePolicy) -> Mapping[str, NetworkSpec]:
+    """Where a policy keeps its networks; a stock policy's are those of its sparse counterpart.
+
+    :raises UnsupportedError: for a policy without a counterpart, or with layers elsewhere
+    """
+    if isinstance(policy, SparsePolicyMixin):
+        return policy.networks
+    for algorithm in supported_algorithms().values():
+        sparse: Any = algorithm.policy_aliases["SparsePolicy"]
+        stock = next(c for c in sparse.__mro__ if not c.__module__.startswith("sb3_sparse."))
+        if isinstance(policy, stock):
+            specs: Mapping[str, NetworkSpec] = sparse.networks
+            _check_complete(policy, specs)
+            return specs
+    raise UnsupportedError(
+        f"the networks of {type(policy).__name__} are not known; known are the policies of "
+        f"{', '.join(supported_algorithms())}"
+    )
+
+
+def _check_complete(policy: BasePolicy, specs: Mapping[str, NetworkSpec]) -> None:
+    known = {id(module) for name in specs for module in kernels_of(policy, specs[name]).values()}
+    targets = tuple(f"{spec.target}." for spec in specs.values() if spec.target is not None)
+    for name, module in policy.named_modules():
+        other = isinstance(module, KERNEL_TYPES) and id(module) not in known
+        if isinstance(module, UNSUPPORTED_TYPES) or (other and not name.startswith(targets)):
+            raise UnsupportedError(
+                f"{name}, a {type(module).__name__} of {type(policy).__name__}, is no Linear or "
+                f"Conv layer of the networks {', '.join(map(repr, specs))}"
+            )
+
+
+def modules_of(policy: nn.Module, spec: NetworkSpec) -> dict[str, nn.Module]:
+    """Every module that a network runs once, shared ones too, by dotted name."""
+    named = dict(policy.named_modules(remove_duplicate=False))
+    found: dict[int, tuple[str, nn.Module]] = {}
+    for root in spec.roots:
+        if root in named:
+            for name, module in named[root].named_modules(prefix=root):
+                found.setdefault(id(module), (name, module))
+    return dict(found.values())
+
+
+def kernels_of(policy: nn.Module, spec: NetworkSpec) -> dict[str, Kernel]:
+    """Every Linear and Conv layer that a network runs, shared ones too, by dotted name."""
+    modules = modules_of(policy, spec)
+    return {name: module for name, module in modules.items() if isinstance(module, KERNEL_TYPES)}
+
+
+def parameters_by_network(policy: BasePolicy) -> dict[str, list[str]]:
+    """Names of the parameters that are trained; what several networks share is the first's.
+
+    What lies in no network (the ``log_std`` of PPO) is the first's too.
+    """
+    specs = specs_of(policy)
+    names = {id(p): name for name, p in policy.named_parameters() if p.requires_grad}
+    found: dict[str, list[str]] = {}
+    for network, spec in specs.items():
+        parameters = [p for m in modules_of(policy, spec).values() for p in m.parameters(False)]
+        found[network] = [names.pop(id(p)) for p in parameters if id(p) in names]
+    targets = tuple(f"{spec.target}." for spec in specs.values() if spec.target is not None)
+    found[next(iter(specs))] += [name for name in names.values() if not name.startswith(targets)]
+    return found
+
+
+def connections(policy: BasePolicy) -> dict[str, NDArray[Any] | None]:
+    """The mask of every kernel, flat, by its parameter's name; None where all are active."""
+    names = {id(p): name for name, p in policy.named_parameters()}
+    found: dict[str, NDArray[Any] | None] = {}
+    for spec in specs_of(policy).values():
+        for module in kernels_of(policy, spec).values():
+            found[names[id(module.weight)]] = None
+    if isinstance(policy, SparsePolicyMixin):
+        for layer in policy.sparse.layers:
+            found[names[id(layer.weight)]] = layer.mask()
+    return found
+
+
+class _LeftOut:
+    """Stands in a twin for what it does without."""
+
+
+def dense_twin(policy: BasePolicy) -> BasePolicy:
+    """A copy to compute with, whatever becomes of it: frozen, in evaluation mode.
+
+    It has no optimizers. Every layer has its dense weight, 0 where inactive, under the same
+    parameter name, so that gradients at inactive connections can be taken.
+    """
+    memo: dict[int, Any] = {}
+    for module in policy.modules():
+        for name, value in vars(module).items():
+            if isinstance(value, (th.optim.Optimizer, Controller)):
+                memo[id(value)] = _LeftOut()
+            elif name == "action_dist":  # its last distribution hangs on a graph
+                memo[id(value)] = copy.copy(value)
+    twin = type(policy).__new__(type(policy))
+    memo[id(policy)] = twin
+    twin.__dict__.update(copy.deepcopy(policy.__dict__, memo))
+    for module in twin.modules():
+        if isinstance(module, ChainedSequential):
+            module.__class__ = nn.Sequential  # type: ignore[assignment]
+        elif isinstance(module, CompactLinear):
+            dense = module.dense()
+            module.__class__ = nn.Linear  # type: ignore[assignment]
+            module.weight = nn.Parameter(dense)
+    for parameter in twin.parameters():
+        parameter.requires_grad_(False)
+    return twin.train(False)

@@ -1,0 +1,147 @@
+"""``sb3-sparse study``: list, run, status and report."""
+
+from __future__ import annotations
+
+import shlex
+from collections import Counter
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.table import Table
+
+from sb3_sparse.cli.common import INTERRUPTED, console, text
+from sb3_sparse.cli.studyprogress import StudyProgress
+
+if TYPE_CHECKING:
+    from sb3_sparse.experiments import Study
+    from sb3_sparse.experiments.standing import CellStanding
+
+studies = typer.Typer(no_args_is_help=True)
+Name = Annotated[str, typer.Argument(help="A name of `study list`, or a file of your own, .yml.")]
+Scale = Annotated[
+    str, text("smoke (minutes), small (a night on a laptop) or paper (its seeds and steps).")
+]
+Store = Annotated[Path, text("Where runs and reports go; studies share it.", "--folder", "-f")]
+
+
+@studies.command("list")
+def list_() -> None:
+    """Every study that comes with the package."""
+    from sb3_sparse.experiments import Study, study_names
+    from sb3_sparse.experiments.spec import SCALES
+
+    table = Table("study", "what", *SCALES, box=None, header_style="bold")
+    for name in study_names():
+        scales = [Study.read(name, scale) for scale in SCALES]
+        table.add_row(name, scales[0].title, *(str(len(study.cells)) for study in scales))
+    console.print(table)
+    console.print("Numbers are runs. Go on with: sb3-sparse study run NAME --scale SCALE")
+
+
+@studies.command()
+def run(
+    name: Name,
+    scale: Scale = "small",
+    workers: Annotated[int, text("Runs at once, each a process of one thread.")] = 1,
+    launcher: Annotated[
+        str, text("local: processes of this machine; ray: a Ray cluster.")
+    ] = "local",
+    address: Annotated[
+        str | None, text("Of the Ray cluster, e.g. auto.", shown="one of this machine")
+    ] = None,
+    store: Store = Path("studies"),
+) -> None:
+    """Train what a study lacks. What is done stays done; the same command goes on."""
+    from sb3_sparse.experiments import Study, run_study
+    from sb3_sparse.launch import launcher_named
+
+    study = Study.read(name, scale)
+    runner = run_study(study, store, launcher_named(launcher, address), workers)
+    shown = StudyProgress(console)
+    last = None
+    try:
+        for last in runner:
+            shown(last)
+    except KeyboardInterrupt:
+        console.print("Stopping; what is running is kept up to its last checkpoint ...")
+        runner.close()
+        console.print(f"Go on with: {_command('run', name, scale, store, workers)}")
+        raise typer.Exit(INTERRUPTED) from None
+    finally:
+        shown.close()
+    assert last is not None
+    if last.elsewhere:
+        console.print(f"{last.elsewhere} runs are trained by other processes; look again with:")
+        console.print(_command("status", name, scale, store), soft_wrap=True)
+    for failed, error in last.failed.items():
+        console.print(f"\nFailed twice: {failed}", markup=False, style="bold", soft_wrap=True)
+        console.print(error.rstrip(), markup=False, soft_wrap=True)
+    console.print(f"{last.done} of {last.planned} runs are done. Draw them:")
+    console.print(_command("report", name, scale, store), soft_wrap=True)
+    if last.failed:
+        raise typer.Exit(1)
+
+
+@studies.command()
+def status(name: Name, scale: Scale = "small", store: Store = Path("studies")) -> None:
+    """How far a study is, and which of its runs failed."""
+    from sb3_sparse.experiments import Study
+    from sb3_sparse.experiments.standing import FAILED, RUNNING, STOPPED, counts
+
+    study = Study.read(name, scale)
+    standings = _standings(study, store)
+    found = counts(standings)
+    console.print(f"{study.title}, scale {scale}: {len(standings)} runs")
+    console.print(", ".join(f"{number} {what}" for what, number in found.items()))
+    done = Counter(one.cell.run.env_id for one in standings if one.status == "done")
+    for env_id, planned in Counter(one.cell.run.env_id for one in standings).items():
+        console.print(f"  {env_id}: {done[env_id]} of {planned}")
+    for one in standings:
+        if one.status in (RUNNING, STOPPED):
+            console.print(f"{one.status}: {one.cell.name}, {one.steps} steps", markup=False)
+        if one.status == FAILED:
+            where = one.cell.errors(store)
+            console.print(f"failed: {one.cell.name}; see {where}", markup=False, soft_wrap=True)
+
+
+@studies.command()
+def report(
+    name: Name,
+    scale: Scale = "small",
+    store: Store = Path("studies"),
+    out: Annotated[
+        Path | None, text("Where it is written.", "--out", "-o", shown="<folder>/<name>/<scale>")
+    ] = None,
+) -> None:
+    """Figures, tables and verdicts of what is done, as one page that opens from disk."""
+    from sb3_sparse.experiments import Study
+    from sb3_sparse.report import write_report
+
+    study = Study.read(name, scale)
+    standings = _standings(study, store)
+    page = write_report(
+        [one.folder for one in standings if one.folder.is_dir()],
+        out or store / study.report_folder,
+        title=f"{study.title} ({scale})",
+        figures=study.figures,
+        varies=study.varies,
+        command=_command("run", name, scale, store),
+        pending=[one.cell.name for one in standings if one.status != "done"],
+    )
+    console.print(f"Written: {page}", soft_wrap=True)
+
+
+def _standings(study: Study, store: Path) -> list[CellStanding]:
+    from sb3_sparse.experiments import standing_of
+
+    return [standing_of(cell, store) for cell in study.cells]
+
+
+def _command(what: str, name: str, scale: str, store: Path, workers: int = 1) -> str:
+    words = ["sb3-sparse", "study", what, name, "--scale", scale]
+    if store != Path("studies"):
+        words += ["--folder", str(store)]
+    if workers > 1:
+        words += ["--workers", str(workers)]
+    return shlex.join(words)

@@ -1,0 +1,80 @@
+"""One cell of a study: a run, what is measured of it, and the folder that its content names."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from sb3_sparse.experiments.measures import Measures
+from sb3_sparse.zoo.run import Run
+
+RUNS = "runs"
+DIGITS = 12
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A run with all that is measured of it. Two studies that want the same share it.
+
+    :param run: what is trained
+    :param measures: what is measured beside its evaluations
+    :param trained: False: its networks are only built and counted
+    """
+
+    run: Run
+    measures: Measures = field(default_factory=Measures)
+    trained: bool = True
+
+    @cached_property
+    def address(self) -> str:
+        """12 hexadecimal digits of all that decides what comes out.
+
+        That is every setting after configs and overrides, the seed, the evaluations, and what is
+        measured during training; not the device, and not what is measured of the trained model,
+        which may be added later.
+        """
+        run = self.run
+        content = {
+            "algo": run.algo,
+            "env_id": run.env_id,
+            "seed": run.seed,
+            "settings": run.settings(),
+            "evaluation": run.evaluation(),
+            "match_params": run.match_params,
+            "during": self.measures.during,
+            "trained": self.trained,
+        }
+        text = json.dumps(content, sort_keys=True, default=_plain)
+        return hashlib.sha256(text.encode()).hexdigest()[:DIGITS]
+
+    def folder(self, store: Path) -> Path:
+        """The run's folder, ``<store>/runs/<algo>/<env>_<address>``."""
+        env_name = self.run.env_id.replace("/", "-")
+        return store / RUNS / self.run.algo / f"{env_name}_{self.address}"
+
+    def errors(self, store: Path) -> Path:
+        """The file with the tracebacks of a cell that failed; it is there only if it did."""
+        return store / "failed" / f"{self.address}.txt"
+
+    @property
+    def name(self) -> str:
+        """What it is, in a few words."""
+        run = self.run
+        if run.match_params is not None:
+            how = f"dense as {run.match_params:.0%}"
+        else:
+            share = "" if run.sparsity is None else f" {run.sparsity:.0%}"
+            how = f"{run.method or run.conf_file or 'rigl'}{share}"
+        changed = "".join(f", {name} {value}" for name, value in run.hyperparams.items())
+        where = "" if run.distribution is None else f" {run.distribution}"
+        return f"{run.algo} {run.env_id} {how}{where}{changed}, seed {run.seed}"
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, type):
+        return f"{value.__module__}.{value.__qualname__}"
+    raise TypeError(f"{value!r} has no place in a study; give plain values")

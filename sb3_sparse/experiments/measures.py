@@ -1,0 +1,69 @@
+"""What a study measures of its runs beside their evaluations."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from sb3_sparse.errors import ConfigError
+
+DURING = {"snr": ("every", "batch_size"), "plasticity": ("every",)}
+AFTER = {"noise": ("sigmas", "n_episodes", "seeds")}
+FILES = {"snr": "snr.csv", "plasticity": "plasticity.csv", "noise": "robustness.csv"}
+
+
+@dataclass(frozen=True)
+class Measures:
+    """Names and arguments.
+
+    :param during: what callbacks measure while a run is trained
+    :param after: what is measured of the trained model
+    """
+
+    during: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    after: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, given: Any) -> Measures:
+        """From a study's ``measures``: names to arguments.
+
+        :raises ConfigError: for another name or argument
+        """
+        if not isinstance(given, Mapping):
+            raise ConfigError(
+                f"measures must map names to arguments, e.g. snr: {{every: 10000}}, got {given!r}"
+            )
+        for name, arguments in given.items():
+            allowed = {**DURING, **AFTER}
+            if name not in allowed:
+                raise ConfigError(f"unknown measure {name!r}; allowed are {', '.join(allowed)}")
+            if not isinstance(arguments, Mapping) or not set(arguments) <= set(allowed[name]):
+                raise ConfigError(
+                    f"measure {name} takes {', '.join(allowed[name])}, got {arguments!r}"
+                )
+        return cls(
+            {name: dict(given[name]) for name in DURING if name in given},
+            {name: dict(given[name]) for name in AFTER if name in given},
+        )
+
+    def callbacks(self, folder: Path) -> list[Any]:
+        """New callbacks that write into a run's folder."""
+        if not self.during:
+            return []
+        from sb3_sparse.analysis import GradientSNRCallback, PlasticityCallback
+
+        classes = {"snr": GradientSNRCallback, "plasticity": PlasticityCallback}
+        return [
+            classes[name](**arguments, path=folder / FILES[name])
+            for name, arguments in self.during.items()
+        ]
+
+    def missing(self, record: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
+        """What is still to be measured of a trained model.
+
+        :param record: the content of its ``sparsity.json``
+        """
+        measured = record.get("measured", {})
+        return {name: given for name, given in self.after.items() if measured.get(name) != given}

@@ -1,0 +1,114 @@
+"""Running a study: every cell that is not done, several at a time."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Generator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from sb3_sparse.experiments.cell import Cell
+from sb3_sparse.experiments.spec import Study
+from sb3_sparse.experiments.standing import DONE, RUNNING, standing_of
+from sb3_sparse.launch.base import Ended, Launcher, Task
+
+FUNCTION = "sb3_sparse.experiments.work:work_on"
+
+
+@dataclass
+class Progress:
+    """How far a study is.
+
+    :param planned: its cells
+    :param done: cells that are done, before this start too
+    :param elsewhere: cells that another process trains
+    :param running: cells that are trained now
+    :param failed: cells that failed twice, with their tracebacks
+    :param retried: names of cells that failed once
+    :param ended: the cell that has just ended, if one has
+    """
+
+    planned: int
+    done: int = 0
+    elsewhere: int = 0
+    running: int = 0
+    failed: dict[str, str] = field(default_factory=dict)
+    retried: list[str] = field(default_factory=list)
+    ended: str | None = None
+    finished_here: int = 0
+    started: float = field(default_factory=time.monotonic)
+
+    @property
+    def open(self) -> int:
+        """Cells that are still to be done here."""
+        return self.planned - self.done - self.elsewhere - len(self.failed)
+
+    @property
+    def seconds_left(self) -> float | None:
+        """At the speed so far; None before the first cell has ended."""
+        if self.finished_here == 0:
+            return None
+        return (time.monotonic() - self.started) / self.finished_here * self.open
+
+
+def run_study(
+    study: Study, store: Path, launcher: Launcher, workers: int
+) -> Generator[Progress, None, None]:
+    """Bring every cell of a study to its end; yields how far it is, about once a second.
+
+    A cell that is done is not run again, an interrupted one goes on, one that fails is tried a
+    second time after all others. Closing the iterator stops the cells that are running at their
+    next rollout; the next call goes on with them.
+
+    :param study: what to run
+    :param store: folder of the studies' runs, which studies share
+    :param launcher: runs the processes
+    :param workers: how many at a time, 1 or more
+    """
+    progress = Progress(len(study.cells))
+    cells = []
+    for cell in study.cells:
+        if standing_of(cell, store).status == DONE:
+            progress.done += 1
+        else:
+            cells.append(cell)
+    yield progress
+    again: list[Cell] = []
+    for attempt in (1, 2):
+        tasks = [_task(cell, store) for cell in (cells if attempt == 1 else again)]
+        left = len(tasks)
+        if not tasks:
+            return
+        for ended in launcher.run(tasks, workers):
+            progress.ended = None
+            if ended is not None:
+                left -= 1
+                cell = ended.task.arguments["cell"]
+                if ended.error is not None and attempt == 1:
+                    again.append(cell)
+                    progress.retried.append(cell.name)
+                _account(progress, cell, store, ended, last=attempt == 2)
+            progress.running = min(workers, left)
+            yield progress
+
+
+def _task(cell: Cell, store: Path) -> Task:
+    log = store / "log" / f"{cell.address}.txt"
+    return Task(cell.name, FUNCTION, {"cell": cell, "store": store.absolute()}, log)
+
+
+def _account(progress: Progress, cell: Cell, store: Path, ended: Ended, last: bool) -> None:
+    if ended.error is not None:
+        path = cell.errors(store)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("a") as file:
+            file.write(f"{cell.name}\n{ended.error.rstrip()}\n\n")
+        if last:
+            progress.failed[cell.name] = ended.error
+        return
+    progress.ended = cell.name
+    if ended.value == DONE:
+        progress.done += 1
+        progress.finished_here += 1
+    elif ended.value == RUNNING:
+        progress.elsewhere += 1

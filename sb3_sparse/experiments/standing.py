@@ -1,0 +1,57 @@
+"""How far a cell is, by its folder alone."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from sb3_sparse.experiments.cell import Cell
+from sb3_sparse.zoo.checkpoint import is_locked
+from sb3_sparse.zoo.record import NAME, read_record
+
+DONE, RUNNING, STOPPED, FAILED, WAITING = "done", "running", "stopped", "failed", "waiting"
+OVER = {True: "finished", False: "counted"}
+
+
+@dataclass(frozen=True)
+class CellStanding:
+    """A cell and how far it is.
+
+    :param cell: which
+    :param folder: its run's folder, there or not
+    :param status: ``"done"``, ``"running"`` (some process trains it now), ``"stopped"`` (it goes on
+        from its last checkpoint), ``"failed"`` or ``"waiting"``
+    :param steps: environment steps done
+    """
+
+    cell: Cell
+    folder: Path
+    status: str
+    steps: int = 0
+
+
+def standing_of(cell: Cell, store: Path) -> CellStanding:
+    """How far a cell is.
+
+    :param store: folder of the studies' runs
+    :raises ConfigError: if its record is damaged
+    """
+    folder = cell.folder(store)
+    failed = cell.errors(store).is_file()
+    if not (folder / NAME).is_file():
+        return CellStanding(cell, folder, FAILED if failed else WAITING)
+    record = read_record(folder)
+    steps = int(record.get("num_timesteps", 0))
+    if is_locked(folder):
+        return CellStanding(cell, folder, RUNNING, steps)
+    if record["status"] == OVER[cell.trained] and not cell.measures.missing(record):
+        return CellStanding(cell, folder, DONE, steps)
+    return CellStanding(cell, folder, FAILED if failed else STOPPED, steps)
+
+
+def counts(standings: Sequence[CellStanding]) -> dict[str, int]:
+    """How many cells there are of each status."""
+    found = Counter(one.status for one in standings)
+    return {status: found[status] for status in (DONE, RUNNING, STOPPED, FAILED, WAITING)}

@@ -1,0 +1,34 @@
+"""The one door to rliable, scipy and matplotlib."""
+
+from __future__ import annotations
+
+from sb3_sparse.errors import MissingExtra
+
+try:
+    import matplotlib
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import (
+        EngFormatter,
+        LogLocator,
+        MaxNLocator,
+        NullFormatter,
+        PercentFormatter,
+    )
+    from rliable import library as rliable_library
+    from scipy.stats import t as student_t
+except ImportError as error:
+    raise MissingExtra("reports on runs", "report") from error
+
+__all__ = [
+    "Axes",
+    "EngFormatter",
+    "Figure",
+    "LogLocator",
+    "MaxNLocator",
+    "NullFormatter",
+    "PercentFormatter",
+    "matplotlib",
+    "rliable_library",
+    "student_t",
+]

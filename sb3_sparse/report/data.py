@@ -1,0 +1,243 @@
+"""Run folders, read; what cannot be read is named with its reason, never averaged."""
+
+from __future__ import annotations
+
+import json
+import math
+import zipfile
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from sb3_sparse.errors import ConfigError
+from sb3_sparse.report.measured import Rows, read_rows
+from sb3_sparse.report.methods import DENSE, EQUAL
+from sb3_sparse.report.settings import callback_of, family_of
+from sb3_sparse.zoo.record import NAME, read_record
+from sb3_sparse.zoo.results import score_of
+
+Array = npt.NDArray[np.float64]
+FINISHED, COUNTED = "finished", "counted"
+MEASURED = {
+    "snr.csv": ("timesteps", "name", "value"),
+    "plasticity.csv": ("timesteps", "name", "value"),
+    "robustness.csv": ("sigma", "seed", "episode", "return"),
+}
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """Something that is not in the report.
+
+    :param folder: the run's folder
+    :param reason: why
+    """
+
+    folder: Path
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class RunData:
+    """What a run folder says of its run.
+
+    :param folder: where it was read
+    :param record: content of ``sparsity.json``
+    :param timesteps: environment steps of each evaluation, shape ``[T]``; empty if never trained
+    :param returns: mean episode return of each evaluation, shape ``[T]``
+    :param measured: rows of the other files, by file name; only those that are there
+    """
+
+    folder: Path
+    record: Mapping[str, Any]
+    timesteps: Array
+    returns: Array
+    measured: Mapping[str, Rows] = field(default_factory=dict)
+
+    @property
+    def trained(self) -> bool:
+        """Whether it was trained, not only counted."""
+        return bool(self.record["status"] == FINISHED)
+
+    @property
+    def algo(self) -> str:
+        return str(self.record["run"]["algo"])
+
+    @property
+    def env_id(self) -> str:
+        return str(self.record["run"]["env_id"])
+
+    @property
+    def seed(self) -> int:
+        return int(self.record["run"]["seed"])
+
+    @property
+    def settings(self) -> Mapping[str, Any]:
+        found: Mapping[str, Any] = self.record["settings"]
+        return found
+
+    @property
+    def steps(self) -> int:
+        """Environment steps asked for."""
+        return int(self.settings.get("n_timesteps", 0))
+
+    @cached_property
+    def family(self) -> str:
+        """Algorithm, architecture and suite: what is compared with one another."""
+        return family_of(self.algo, self.env_id, self.settings)
+
+    @cached_property
+    def label(self) -> str:
+        """Method; a dense network of fewer parameters has a label of its own."""
+        method = str(self.record["method"])
+        small = self.record["run"].get("match_params") is not None
+        return EQUAL if method == DENSE and small else method
+
+    @cached_property
+    def level(self) -> float:
+        """Removed fraction of the network, or that whose parameter count a dense one matches."""
+        matched = self.record["run"].get("match_params")
+        if matched is not None:
+            return float(matched)
+        if self.label == DENSE:
+            return 0.0
+        asked = self.settings.get("policy_kwargs", {}).get("sparsity")
+        if isinstance(asked, (int, float)):
+            return float(asked)
+        return round(float(self.record["total"]["sparsity"]), 3)
+
+    @cached_property
+    def score(self) -> float:
+        """Mean over the last 10 % of the evaluations."""
+        return score_of([float(value) for value in self.returns])
+
+    @property
+    def parameters(self) -> int:
+        """Active weights and biases."""
+        return int(self.record["total"]["parameters"])
+
+    @property
+    def flops(self) -> int:
+        """Of one forward pass of all networks, for one observation."""
+        return int(self.record["total"]["flops"])
+
+    @property
+    def dense_flops(self) -> int:
+        """The same, were every connection there."""
+        return int(self.record["total"]["dense_flops"])
+
+    @property
+    def layers(self) -> list[dict[str, Any]]:
+        return list(self.record["layers"])
+
+    @cached_property
+    def actor_share(self) -> float | None:
+        """Fraction of all connections that the actor has; None without an actor."""
+        counts: dict[str, int] = {}
+        for layer in self.layers:
+            counts[layer["network"]] = counts.get(layer["network"], 0) + int(layer["nnz"])
+        total = sum(counts.values())
+        return counts["actor"] / total if len(counts) > 1 and counts.get("actor") else None
+
+    @property
+    def callback(self) -> Mapping[str, Any]:
+        """Arguments of the mask's schedule."""
+        return callback_of(self.settings)
+
+
+def read_runs(folders: Iterable[Path | str]) -> tuple[list[RunData], list[LeftOut]]:
+    """Read run folders.
+
+    :param folders: each the folder of one run, e.g. ``logs/dqn/CartPole-v1_1``
+    :return: finished and counted runs in a fixed order, and what was left out. Of two runs with the
+        same settings and seed the first in the order of folders stays
+    """
+    runs: list[RunData] = []
+    out: list[LeftOut] = []
+    first: dict[str, Path] = {}
+    for folder in sorted({Path(folder) for folder in folders}):
+        try:
+            run, remarks = _read(folder)
+        except ConfigError as error:
+            out.append(LeftOut(folder, str(error)))
+            continue
+        same = first.setdefault(_identity(run), folder)
+        if same != folder:
+            out.append(LeftOut(folder, f"duplicate: the same settings and seed as {same}"))
+            continue
+        runs.append(run)
+        out += [LeftOut(folder, remark) for remark in remarks]
+    return runs, out
+
+
+def _read(folder: Path) -> tuple[RunData, list[str]]:
+    if not folder.is_dir():
+        raise ConfigError("missing: there is no such folder")
+    try:
+        record = read_record(folder)
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{NAME} cannot be read: {error}") from error
+    _check(record)
+    empty = np.zeros(0)
+    timesteps, returns = empty, empty
+    if record["status"] == FINISHED:
+        timesteps, returns = _evaluations(folder / "evaluations.npz")
+    measured, remarks = {}, []
+    for name, columns in MEASURED.items():
+        if (folder / name).is_file():
+            try:
+                measured[name] = read_rows(folder / name, columns)
+            except ConfigError as error:
+                remarks.append(f"only its {name}: {error}; all else of the run is in")
+    return RunData(folder, record, timesteps, returns, measured), remarks
+
+
+def _check(record: Any) -> None:
+    """A record that all figures can rely on."""
+    if not isinstance(record, dict):
+        raise ConfigError(f"{NAME} is damaged: it holds no mapping")
+    status = record.get("status")
+    if status == "failed":
+        raise ConfigError(f"failed: {record.get('error') or 'no reason is recorded'}")
+    if status not in (FINISHED, COUNTED):
+        raise ConfigError(f"not finished: its status is {status!r}")
+    for name in ("run", "settings", "total", "layers", "method"):
+        if not record.get(name):
+            raise ConfigError(f"{NAME} is incomplete: {name!r} is missing")
+    needed = {"run": ("algo", "env_id", "seed"), "total": ("sparsity", "parameters", "flops")}
+    for part, names in needed.items():
+        for name in names:
+            if not isinstance(record[part], dict) or record[part].get(name) is None:
+                raise ConfigError(f"{NAME} is incomplete: {part}.{name} is missing")
+
+
+def _evaluations(path: Path) -> tuple[Array, Array]:
+    if not path.is_file():
+        raise ConfigError(f"{path.name} is missing")
+    try:
+        with np.load(path) as content:
+            timesteps = np.asarray(content["timesteps"], dtype=np.float64)
+            results = np.asarray(content["results"], dtype=np.float64)
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise ConfigError(f"{path.name} is damaged: {error}") from error
+    if results.ndim != 2 or results.size == 0 or len(results) != len(timesteps):
+        raise ConfigError(
+            f"{path.name} is damaged: results of shape {results.shape} for "
+            f"{len(timesteps)} evaluations"
+        )
+    returns = results.mean(axis=1)
+    if not all(map(math.isfinite, returns)):
+        raise ConfigError(f"{path.name} holds returns that are not finite")
+    return timesteps, returns
+
+
+def _identity(run: RunData) -> str:
+    keys = ("algo", "env_id", "seed", "match_params")
+    asked = {name: run.record["run"].get(name) for name in keys}
+    content = [asked, run.record["method"], run.trained, run.settings]
+    return json.dumps(content, sort_keys=True, default=str)

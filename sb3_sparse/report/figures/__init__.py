@@ -1,0 +1,25 @@
+"""One file a figure; importing this package enters them all into the table."""
+
+from sb3_sparse.report.figures import (  # noqa: F401
+    aggregate,
+    curves,
+    flops,
+    improvement,
+    masks,
+    noise,
+    parameters,
+    profiles,
+    ratio,
+    sensitivity,
+    snr,
+)
+from sb3_sparse.report.figures.base import (
+    FIGURES,
+    Drawing,
+    NotEnoughData,
+    check_figures,
+    draw,
+    save,
+)
+
+__all__ = ["FIGURES", "Drawing", "NotEnoughData", "check_figures", "draw", "save"]

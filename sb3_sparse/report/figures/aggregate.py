@@ -1,0 +1,44 @@
+"""Interquartile mean of each method."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sb3_sparse.report.figures.base import Drawing, NotEnoughData, figure, panels
+from sb3_sparse.report.methods import look_of, name_of, percent
+from sb3_sparse.report.scores import panels_of, why_not
+from sb3_sparse.report.statistics import iqm_estimates
+from sb3_sparse.report.study import Study
+
+HEADS = ("family", "sparsity", "method", "iqm", "low", "high", "seeds", "tasks")
+
+
+@figure(
+    "iqm",
+    "Interquartile mean",
+    "Mean of the middle half of normalised scores over runs and tasks, with 95 % stratified "
+    "bootstrap intervals (rliable); a panel for each sparsity.",
+)
+def draw(study: Study) -> Drawing:
+    """A panel a sparsity, an interval a method."""
+    found, remarks = panels_of(study)
+    if not found:
+        raise NotEnoughData(why_not(study, remarks))
+    made, axes = panels(len(found))
+    rows: list[list[Any]] = []
+    for one, (family, level, scores, tasks) in zip(axes, found, strict=True):
+        estimates = iqm_estimates(scores)
+        for place, (label, estimate) in enumerate(estimates.items()):
+            look = look_of(label)
+            ends = [estimate.low, estimate.high]
+            one.plot(ends, [place, place], color=look.color, linewidth=9, alpha=0.35,
+                     solid_capstyle="butt")  # fmt: skip
+            one.plot(estimate.value, place, look.marker, color=look.color, markersize=7)
+            low, high, value = estimate.low, estimate.high, estimate.value
+            rows.append([family, level, label, value, low, high, estimate.seeds, estimate.tasks])
+        one.set_yticks(range(len(estimates)), [name_of(label) for label in estimates])
+        one.invert_yaxis()
+        one.margins(x=0.08, y=0.12)
+        one.set_title(f"{family}\n{percent(level)}, {len(tasks)} task(s)")
+        one.set_xlabel("IQM of normalised scores")
+    return Drawing(made, HEADS, rows, remarks)

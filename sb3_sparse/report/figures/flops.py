@@ -1,0 +1,53 @@
+"""FLOPs against sparsity, by distribution."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sb3_sparse.report.backend import PercentFormatter
+from sb3_sparse.report.figures.base import Drawing, NotEnoughData, figure, legend, panels
+from sb3_sparse.report.methods import DENSE, EQUAL
+from sb3_sparse.report.study import Study
+
+HEADS = ("family", "environment", "distribution", "sparsity", "flops", "dense flops", "share")
+DRAWN = {
+    "erk": ("#362682", "o", "-"),
+    "er": ("#009E73", "^", "-."),
+    "uniform": ("#FE6100", "s", "--"),
+}
+
+
+@figure(
+    "flops",
+    "FLOPs",
+    "Floating-point operations of one forward pass of all networks, as a share of the dense "
+    "network's, against sparsity; counted from the layers, trained or not.",
+)
+def draw(study: Study) -> Drawing:
+    """A panel an architecture, a line a distribution."""
+    found: dict[tuple[str, str], dict[str, dict[float, tuple[int, int]]]] = {}
+    for run in study.runs:
+        if run.label not in (DENSE, EQUAL) and run.dense_flops:
+            kind = str(study.setting(run, "distribution"))
+            counted = found.setdefault((run.family, run.env_id), {}).setdefault(kind, {})
+            counted.setdefault(run.level, (run.flops, run.dense_flops))
+    if not found:
+        raise NotEnoughData("no sparse run has its FLOPs counted")
+    made, axes = panels(len(found), columns=3, height=3.0)
+    rows: list[list[Any]] = []
+    for one, ((family, env_id), lines) in zip(axes, sorted(found.items()), strict=True):
+        for kind, counts in sorted(lines.items()):
+            color, marker, style = DRAWN.get(kind, ("#444444", "D", ":"))
+            levels = sorted(counts)
+            shares = [counts[level][0] / counts[level][1] for level in levels]
+            one.plot(levels, shares, color=color, marker=marker, linestyle=style, label=kind)
+            for level, share in zip(levels, shares, strict=True):
+                rows.append([family, env_id, kind, level, *counts[level], share])
+        one.set_title(f"{family}\n{env_id}")
+        one.set_xlabel("sparsity")
+        one.set_ylabel("FLOPs, share of dense")
+        one.set_ylim(bottom=0)
+        one.xaxis.set_major_formatter(PercentFormatter(1.0, symbol=" %"))
+        one.yaxis.set_major_formatter(PercentFormatter(1.0, symbol=" %"))
+    legend(made, axes)
+    return Drawing(made, HEADS, rows)

@@ -1,0 +1,59 @@
+"""Probability that one method beats another."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sb3_sparse.report.figures.base import Drawing, NotEnoughData, figure, panels
+from sb3_sparse.report.methods import DENSE, EQUAL, look_of, name_of, percent
+from sb3_sparse.report.scores import panels_of, why_not
+from sb3_sparse.report.statistics import improvement
+from sb3_sparse.report.study import Study
+
+HEADS = ("family", "sparsity", "method", "against", "probability", "low", "high", "seeds", "tasks")
+SHORT = {DENSE: "dense 100 %", EQUAL: "equal dense"}
+
+
+@figure(
+    "improvement",
+    "Probability of improvement",
+    "Probability that a run of the first method scores higher than one of the second on the same "
+    "task, mean over tasks, ties counted half, with 95 % stratified bootstrap intervals (rliable). "
+    "The vertical line is no difference.",
+)
+def draw(study: Study) -> Drawing:
+    """Sparse methods against both dense networks, and RigL against SET."""
+    found, remarks = panels_of(study)
+    paired = [(*one, pairs) for one in found if (pairs := _pairs(list(one[2])))]
+    if not paired:
+        raise NotEnoughData(
+            "no sparsity has two methods to compare" if found else why_not(study, remarks)
+        )
+    most = max(len(pairs) for *_, pairs in paired)
+    made, axes = panels(len(paired), height=1.2 + 0.26 * most)
+    rows: list[list[Any]] = []
+    for one, (family, level, scores, tasks, pairs) in zip(axes, paired, strict=True):
+        for place, (better, worse) in enumerate(pairs):
+            estimate = improvement(scores[better], scores[worse])
+            value, low, high = estimate.value, estimate.low, estimate.high
+            look = look_of(better)
+            one.plot([low, high], [place, place], color=look.color, linewidth=4, alpha=0.4)
+            one.plot(value, place, look.marker, color=look.color, markersize=6)
+            rows.append(
+                [family, level, better, worse, value, low, high, estimate.seeds, len(tasks)]
+            )
+        one.axvline(0.5, color="#444444", linewidth=0.8)
+        one.set_xlim(-0.06, 1.06)
+        texts = [f"{name_of(a)} > {SHORT.get(b, name_of(b))}" for a, b in pairs]
+        one.set_yticks(range(len(pairs)), texts)
+        one.invert_yaxis()
+        one.set_title(f"{family}\n{percent(level)}, {len(tasks)} task(s)")
+        one.set_xlabel("probability")
+    return Drawing(made, HEADS, rows, remarks)
+
+
+def _pairs(labels: list[str]) -> list[tuple[str, str]]:
+    dense = [label for label in (EQUAL, DENSE) if label in labels]
+    sparse = [label for label in labels if label not in (EQUAL, DENSE)]
+    pairs = [(label, other) for other in dense for label in sparse]
+    return pairs + ([("rigl", "set")] if {"rigl", "set"} <= set(sparse) else [])

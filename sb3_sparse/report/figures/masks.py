@@ -1,0 +1,123 @@
+"""Final masks."""
+
+from __future__ import annotations
+
+import io
+import pickle
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch as th
+
+from sb3_sparse.report.backend import MaxNLocator
+from sb3_sparse.report.data import Array, RunData
+from sb3_sparse.report.figures.base import Drawing, NotEnoughData, figure, panels
+from sb3_sparse.report.methods import name_of, percent
+from sb3_sparse.report.study import Study
+
+HEADS = ("run", "method", "sparsity", "layer", "shape", "block row", "densities of the blocks")
+BLOCKS, LAYERS, CLOSE_TO = 128, 4, 0.9
+ORDER = ("rigl", "set", "prune", "static")
+
+
+@figure(
+    "masks",
+    "Final masks",
+    "Active connections of trained networks, output units downwards, inputs to the right, in at "
+    "most 128 by 128 blocks: black is all active, white none. One run a method, at the sparsity "
+    "closest to 90 %; the first layers, of which the first reads the observation.",
+)
+def draw(study: Study) -> Drawing:
+    """A row a method, a panel a layer."""
+    remarks: list[str] = []
+    shown: list[tuple[RunData, list[tuple[str, tuple[int, ...], Array]]]] = []
+    for run in _chosen(study):
+        try:
+            masks = masks_of(run)
+        except (OSError, KeyError, ValueError, RuntimeError, pickle.UnpicklingError) as error:
+            remarks.append(f"{run.folder}: its model cannot be read: {error}")
+            continue
+        if masks:
+            shown.append((run, masks))
+        else:
+            remarks.append(f"{run.folder}: its model has no mask")
+    if not shown:
+        why = f" {'; '.join(remarks)}" if remarks else ""
+        raise NotEnoughData(f"no sparse run has a final model with masks.{why}")
+    columns = max(len(masks) for _, masks in shown)
+    made, axes = panels(len(shown) * columns, columns=columns, height=2.3)
+    rows: list[list[Any]] = []
+    for row, (run, masks) in enumerate(shown):
+        here = axes[row * columns : (row + 1) * columns]
+        for one in here[len(masks) :]:
+            one.remove()
+        for one, (name, shape, blocks) in zip(here, masks, strict=False):
+            one.imshow(
+                blocks, cmap="Greys", vmin=0, vmax=1, aspect="auto", interpolation="nearest",
+                extent=(0, int(np.prod(shape[1:])), shape[0], 0),
+            )  # fmt: skip
+            one.grid(visible=False)
+            for axis in (one.xaxis, one.yaxis):
+                axis.set_major_locator(MaxNLocator(5, integer=True))
+            kept = percent(float(f"{density_of(run, name):.3g}"))
+            what = f"{run.env_id}, {name_of(run.label)} at {percent(run.level)}"
+            one.set_title(f"{what}\n{name}: {kept} active")
+            for place, densities in enumerate(blocks):
+                text = " ".join(f"{density:.3g}" for density in densities)
+                dims = "x".join(map(str, shape))
+                rows.append([run.folder.name, run.label, run.level, name, dims, place, text])
+    return Drawing(made, HEADS, rows, remarks)
+
+
+def _chosen(study: Study) -> list[RunData]:
+    """Of the first family and task with sparse runs: one run of each method."""
+    sparse = [run for run in study.main if run.label in ORDER]
+    if not sparse:
+        return []
+    place = min((run.family, run.env_id) for run in sparse)
+    here = [run for run in sparse if (run.family, run.env_id) == place]
+    level = min((run.level for run in here), key=lambda level: (abs(level - CLOSE_TO), level))
+    at = sorted((run for run in here if run.level == level), key=lambda run: run.seed)
+    return [run for label in ORDER for run in [r for r in at if r.label == label][:1]]
+
+
+def masks_of(run: RunData) -> list[tuple[str, tuple[int, ...], Array]]:
+    """Names, shapes and block densities of the first layers' masks, out of the final model.
+
+    :raises OSError: if there is no model, or it is no zip
+    """
+    path = Path(run.folder) / f"{run.env_id.replace('/', '-')}.zip"
+    try:
+        with zipfile.ZipFile(path) as content:
+            state = th.load(
+                io.BytesIO(content.read("policy.pth")), weights_only=True, map_location="cpu"
+            )
+    except zipfile.BadZipFile as error:
+        raise OSError(f"{path.name} is damaged: {error}") from error
+    found = []
+    for layer in run.layers:
+        mask = state.get(f"{layer['name']}.weight_mask")
+        if mask is not None:
+            flat = mask.reshape(mask.shape[0], -1).numpy().astype(np.float64)
+            found.append((str(layer["name"]), tuple(mask.shape), blocks_of(flat)))
+    return found[:LAYERS]
+
+
+def density_of(run: RunData, name: str) -> float:
+    """Share of a layer's connections that is active."""
+    layer = next(layer for layer in run.layers if layer["name"] == name)
+    return float(layer["nnz"]) / float(np.prod(layer["shape"]))
+
+
+def blocks_of(mask: Array, most: int = BLOCKS) -> Array:
+    """Mean of a matrix over at most ``most`` by ``most`` blocks of almost equal size."""
+    for axis in (0, 1):
+        size = mask.shape[axis]
+        if size > most:
+            starts = np.linspace(0, size, most, endpoint=False).astype(int)
+            counts = np.diff([*starts, size])
+            sums = np.add.reduceat(mask, starts, axis=axis)
+            mask = sums / (counts[:, None] if axis == 0 else counts[None, :])
+    return mask

@@ -1,0 +1,58 @@
+"""Return of trained policies under observation noise."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from typing import Any
+
+import numpy as np
+
+from sb3_sparse.report.figures.base import Drawing, NotEnoughData, figure, legend, line, panels
+from sb3_sparse.report.measured import returns_by_sigma
+from sb3_sparse.report.methods import DENSE, name_of, percent, shaded
+from sb3_sparse.report.statistics import means
+from sb3_sparse.report.study import Study
+
+HEADS = ("family", "environment", "method", "parameters kept", "sigma", "return", "low", "high") + (
+    "seeds",
+)
+FILE = "robustness.csv"
+
+
+@figure(
+    "noise",
+    "Robustness to observation noise",
+    "Mean return of trained policies against the strength of noise added to observations, with "
+    "95 % Student t intervals over seeds; colours tell how many parameters are kept, markers "
+    "and line styles the method.",
+)
+def draw(study: Study) -> Drawing:
+    """A panel an environment, a line for each method and regime."""
+    found: dict[tuple[str, str], dict[tuple[float, str], list[dict[float, float]]]] = {}
+    for run in study.main:
+        by_sigma = returns_by_sigma(run.measured.get(FILE, ()))
+        if by_sigma:
+            lines = found.setdefault((run.family, run.env_id), defaultdict(list))
+            lines[run.level, run.label].append(by_sigma)
+    if not found:
+        raise NotEnoughData(f"no run has a {FILE}")
+    made, axes = panels(len(found), columns=3, height=3.2)
+    regimes = sorted({level for lines in found.values() for level, _ in lines})
+    rows: list[list[Any]] = []
+    for one, ((family, env_id), lines) in zip(axes, sorted(found.items()), strict=True):
+        for (level, label), seeds in sorted(lines.items()):
+            sigmas = sorted(set.intersection(*(set(by_sigma) for by_sigma in seeds)))
+            if not sigmas:
+                continue
+            ends = means(np.array([[by_sigma[s] for s in sigmas] for by_sigma in seeds]))
+            look = shaded(label, regimes.index(level))
+            text = name_of(label) if label == DENSE else f"{name_of(label)}, {percent(1 - level)}"
+            line(one, sigmas, ends, look, text)
+            for sigma, *values in zip(sigmas, *ends, strict=True):
+                place: list[Any] = [family, env_id, label, 1 - level, sigma]
+                rows.append([*place, *map(float, values), len(seeds)])
+        one.set_title(f"{family}\n{env_id}")
+        one.set_xlabel("σ of the noise")
+        one.set_ylabel("mean return")
+    legend(made, axes)
+    return Drawing(made, HEADS, rows)

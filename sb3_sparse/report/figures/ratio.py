@@ -1,0 +1,92 @@
+"""Reward against the actor's share of the parameters."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from typing import Any
+
+import numpy as np
+
+from sb3_sparse.report.data import RunData
+from sb3_sparse.report.figures.base import Drawing, NotEnoughData, figure, legend, line, panels
+from sb3_sparse.report.methods import DENSE, name_of, percent, shaded
+from sb3_sparse.report.settings import variant_of
+from sb3_sparse.report.statistics import mean
+from sb3_sparse.report.study import Study
+
+HEADS = (
+    "family",
+    "environment",
+    "method",
+    "budget",
+    "actor's share",
+    "mean score",
+    "low",
+    "high",
+) + ("seeds",)
+Line = tuple[str, float, str]
+
+
+@figure(
+    "ratio",
+    "Actor or critic",
+    "Mean score against the actor's share of all connections (both critics counted) for each "
+    "budget of parameters, with 95 % Student t intervals. The vertical line is the standard "
+    "split, the horizontal one the dense network of full size.",
+)
+def draw(study: Study) -> Drawing:
+    """A panel an environment, a line a budget and method."""
+    found: dict[tuple[str, str], dict[Line, dict[float, list[RunData]]]] = {}
+    for run in study.trained:
+        if run.actor_share is not None:
+            kind = (run.label, run.level, variant_of(run.settings, ("actor_share",)))
+            shares = found.setdefault((run.family, run.env_id), {}).setdefault(kind, {})
+            shares.setdefault(round(run.actor_share, 2), []).append(run)
+    places = {
+        place: kept
+        for place, lines in found.items()
+        if (kept := {kind: shares for kind, shares in lines.items() if len(shares) > 1})
+    }
+    if not places:
+        raise NotEnoughData(
+            "no method was trained with two shares of the actor or more (actor_share) that differ "
+            "in nothing else"
+        )
+    made, axes = panels(len(places), columns=3, height=3.0)
+    rows: list[list[Any]] = []
+    for one, ((family, env_id), lines) in zip(axes, sorted(places.items()), strict=True):
+        budgets = sorted({level for _, level, _ in lines})
+        for (label, level, _), shares in sorted(lines.items()):
+            estimates = {x: mean([run.score for run in runs]) for x, runs in sorted(shares.items())}
+            budget = 1 - level
+            for x, e in estimates.items():
+                rows.append([family, env_id, label, budget, x, e.value, e.low, e.high, e.seeds])
+            ends = [
+                np.array([getattr(e, end) for e in estimates.values()])
+                for end in ("value", "low", "high")
+            ]
+            look = shaded(label, budgets.index(level))
+            text = f"{name_of(label)}, {percent(budget)} of parameters"
+            line(one, [100 * x for x in estimates], (ends[0], ends[1], ends[2]), look, text)
+        usual = _usual(study, family, env_id)
+        if usual is not None:
+            one.axvline(100 * usual, color="#999999", linewidth=0.9, linestyle=":")
+        dense = study.cell(family, env_id, DENSE, 0.0)
+        if dense:
+            level_line = mean([run.score for run in dense]).value
+            one.axhline(level_line, color="#444444", linestyle="--", label=name_of(DENSE))
+        one.set_title(f"{family}\n{env_id}")
+        one.set_xlabel("actor's share of connections, %")
+        one.set_ylabel("mean score")
+    legend(made, axes, columns=2)
+    return Drawing(made, HEADS, rows)
+
+
+def _usual(study: Study, family: str, env_id: str) -> float | None:
+    """The split that nobody asked for: that of the runs without an ``actor_share``."""
+    shares: dict[str, list[float]] = defaultdict(list)
+    for run in study.trained:
+        if (run.family, run.env_id) == (family, env_id) and run.actor_share is not None:
+            asked = study.setting(run, "actor_share")
+            shares["usual" if asked is None else "asked"].append(run.actor_share)
+    return sorted(shares["usual"])[len(shares["usual"]) // 2] if shares["usual"] else None

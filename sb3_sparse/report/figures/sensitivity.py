@@ -1,0 +1,84 @@
+"""Reward against a setting that was varied."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from sb3_sparse.report.data import RunData
+from sb3_sparse.report.figures.base import Drawing, NotEnoughData, figure, legend, line, panels
+from sb3_sparse.report.methods import DENSE, in_order, look_of, name_of, percent
+from sb3_sparse.report.settings import variant_of
+from sb3_sparse.report.statistics import mean
+from sb3_sparse.report.study import Study
+
+HEADS = ("family", "environment", "sparsity", "method", "setting", "value", "mean score", "low") + (
+    "high",
+    "seeds",
+)
+Place = tuple[str, str, float]
+
+
+@figure(
+    "sensitivity",
+    "Sensitivity to a setting",
+    "Mean score against the values of the setting that was varied, all other settings of a line "
+    "being the same, with 95 % Student t intervals; a panel for each environment and sparsity.",
+)
+def draw(study: Study) -> Drawing:
+    """A panel for each environment and sparsity, a line a method."""
+    name = study.varies
+    if name is None:
+        raise NotEnoughData("it needs the name of the setting that was varied (varies)")
+    found: dict[Place, dict[tuple[str, str], dict[Any, list[RunData]]]] = {}
+    for run in study.trained:
+        kind = (run.label, variant_of(run.settings, (name,)))
+        values = found.setdefault((run.family, run.env_id, run.level), {}).setdefault(kind, {})
+        values.setdefault(_key(study.setting(run, name)), []).append(run)
+    places = {
+        place: kept
+        for place, lines in found.items()
+        if (kept := {kind: values for kind, values in lines.items() if len(values) > 1})
+    }
+    if not places:
+        raise NotEnoughData(
+            f"no method was trained with two values of {name} or more that differ in nothing else"
+        )
+    made, axes = panels(len(places), columns=3, height=3.0)
+    rows: list[list[Any]] = []
+    for one, ((family, env_id, level), lines) in zip(axes, sorted(places.items()), strict=True):
+        ticks = sorted({value for values in lines.values() for value in values}, key=_order)
+        order = in_order({label for label, _ in lines})
+        for (label, _), values in sorted(lines.items(), key=lambda item: order.index(item[0][0])):
+            shown = [value for value in ticks if value in values]
+            estimates = [mean([run.score for run in values[value]]) for value in shown]
+            place: list[Any] = [family, env_id, level, label, name]
+            for value, e in zip(shown, estimates, strict=True):
+                rows.append([*place, value, e.value, e.low, e.high, e.seeds])
+            ends = [
+                np.array([getattr(e, end) for e in estimates]) for end in ("value", "low", "high")
+            ]
+            x = [float(ticks.index(value)) for value in shown]
+            line(one, x, (ends[0], ends[1], ends[2]), look_of(label), name_of(label))
+        one.set_xticks(range(len(ticks)), [str(value) for value in ticks])
+        one.set_xlabel(name)
+        one.set_ylabel("mean score")
+        at = "" if level == 0 and order == [DENSE] else f", {percent(level)}"
+        one.set_title(f"{family}\n{env_id}{at}")
+    legend(made, axes)
+    return Drawing(made, HEADS, rows)
+
+
+def _key(value: Any) -> Any:
+    """A value as a mark on the axis."""
+    if isinstance(value, (int, float)) and not isinstance(value, bool):
+        return float(f"{value:.6g}")
+    if isinstance(value, (list, tuple)):
+        return ", ".join(map(str, value)) or "none"
+    return str(value)
+
+
+def _order(value: Any) -> tuple[bool, float, str]:
+    number = value if isinstance(value, float) else 0.0
+    return isinstance(value, str), number, str(value)

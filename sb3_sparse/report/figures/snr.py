@@ -1,0 +1,84 @@
+"""Signal-to-noise ratio of gradients over training."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from typing import Any
+
+import numpy as np
+
+from sb3_sparse.report.figures.base import (
+    Drawing,
+    NotEnoughData,
+    figure,
+    legend,
+    line,
+    logarithmic,
+    panels,
+)
+from sb3_sparse.report.measured import series
+from sb3_sparse.report.methods import DENSE, name_of, percent, shaded
+from sb3_sparse.report.statistics import means
+from sb3_sparse.report.study import Study
+
+HEADS = (
+    "family",
+    "environment",
+    "network",
+    "method",
+    "sparsity",
+    "timesteps",
+    "snr",
+    "low",
+    "high",
+) + ("seeds",)
+FILE, PREFIX = "snr.csv", "snr/"
+Points = list[tuple[float, float]]
+
+
+def of_networks(names: dict[str, Points]) -> dict[str, Points]:
+    """The series over all parameters of a network, active or not, by network."""
+    return {
+        name.removeprefix(PREFIX): points
+        for name, points in names.items()
+        if name.startswith(PREFIX) and "/" not in name.removeprefix(PREFIX)
+    }
+
+
+@figure(
+    "snr",
+    "Signal-to-noise ratio",
+    "Mean over all parameters, active or not, of |mean|/std of the gradients of single samples in "
+    "a minibatch, over training, with 95 % Student t intervals over seeds; a panel for each "
+    "network, a colour for each sparsity, a marker and line style for each method.",
+)
+def draw(study: Study) -> Drawing:
+    """A panel a network, a line for each method and sparsity."""
+    found: dict[tuple[str, str, str], dict[tuple[str, float], list[Points]]] = {}
+    for run in study.main:
+        for network, points in of_networks(series(run.measured.get(FILE, ()))).items():
+            lines = found.setdefault((run.family, run.env_id, network), defaultdict(list))
+            lines[run.label, run.level].append(points)
+    if not found:
+        raise NotEnoughData(f"no run has a {FILE}")
+    made, axes = panels(len(found), columns=3, height=3.0)
+    levels = sorted({level for lines in found.values() for _, level in lines})
+    rows: list[list[Any]] = []
+    for one, ((family, env_id, network), lines) in zip(axes, sorted(found.items()), strict=True):
+        for (label, level), seeds in sorted(lines.items(), key=lambda item: item[0][::-1]):
+            steps = sorted(set.intersection(*({x for x, _ in points} for points in seeds)))
+            if not steps:
+                continue
+            ends = means(np.array([[dict(points)[x] for x in steps] for points in seeds]))
+            look = shaded(label, levels.index(level))
+            text = name_of(label) if label == DENSE else f"{name_of(label)}, {percent(level)}"
+            line(one, steps, ends, look, text)
+            for step, *values in zip(steps, *ends, strict=True):
+                place: list[Any] = [family, env_id, network, label, level, int(step)]
+                rows.append([*place, *map(float, values), len(seeds)])
+        logarithmic(one, "y")
+        one.set_title(f"{family}\n{env_id}, {network}")
+        one.set_xlabel("environment steps")
+        one.set_ylabel("SNR")
+    legend(made, axes)
+    return Drawing(made, HEADS, rows)

@@ -1,0 +1,158 @@
+"""HTML of a page that needs nothing but itself: text, tables that sort, figures, style, script."""
+
+from __future__ import annotations
+
+import base64
+import math
+import re
+from collections.abc import Iterable
+from html import escape
+from typing import Any
+
+from sb3_sparse.report.tables import Table
+
+READABLE = 0.9  # CSS pixels a point
+STYLE = """
+:root { color-scheme: light dark; --line: #c8c8d0; --soft: #f3f3f7; --link: #362682; }
+@media (prefers-color-scheme: dark) {
+  :root { --line: #4a4a55; --soft: #26262e; --link: #b3a6ff; }
+}
+* { box-sizing: border-box; }
+body { font: 16px/1.5 system-ui, sans-serif; margin: 0 auto; max-width: 78rem; padding: 1rem; }
+h1 { font-size: 1.7rem; line-height: 1.2; } h2 { margin-top: 2.5rem; }
+h1, h2, h3, p, li, code, figcaption, summary { overflow-wrap: anywhere; }
+a { color: var(--link); }
+.scroll { overflow-x: auto; border: 1px solid var(--line); border-radius: 6px; }
+table { border-collapse: collapse; font-size: .85rem; width: 100%; }
+th, td { padding: .3rem .6rem; text-align: left; border-bottom: 1px solid var(--line);
+  vertical-align: top; }
+th { background: var(--soft); white-space: nowrap; padding: 0; }
+th button { all: unset; cursor: pointer; padding: .4rem .6rem; display: block; width: 100%;
+  box-sizing: border-box; font-weight: 600; }
+th button:focus-visible { outline: 2px solid var(--link); outline-offset: -2px; }
+th[aria-sort="ascending"] button::after { content: " \\25B2"; }
+th[aria-sort="descending"] button::after { content: " \\25BC"; }
+td.number { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
+td.wide { min-width: 10.5rem; }
+td.supported, td.contradicted, td.undecided { font-weight: 600; white-space: nowrap; }
+td.supported::before { content: "\\2713  "; } td.contradicted::before { content: "\\2717  "; }
+td.undecided::before { content: "?  "; }
+td.supported { color: light-dark(#0a6b3d, #6fd6a2); }
+td.contradicted { color: light-dark(#a8154f, #ff8ab8); }
+figure { margin: 1rem 0 2rem; }
+figure .frame { background: #fff; border: 1px solid var(--line); border-radius: 6px;
+  padding: .5rem; overflow-x: auto; }
+figure img { display: block; max-width: 100%; height: auto; margin: 0 auto; }
+figcaption { font-size: .9rem; margin-top: .4rem; }
+pre { background: var(--soft); padding: .6rem; overflow-x: auto; border-radius: 6px; }
+details { margin: .5rem 0; } summary { cursor: pointer; }
+"""
+
+SCRIPT = """
+document.querySelectorAll("th button").forEach(function (button) {
+  button.addEventListener("click", function () {
+    var head = button.parentElement, table = head.closest("table"), body = table.tBodies[0];
+    var column = head.cellIndex, up = head.getAttribute("aria-sort") !== "ascending";
+    table.querySelectorAll("th").forEach(function (th) { th.setAttribute("aria-sort", "none"); });
+    head.setAttribute("aria-sort", up ? "ascending" : "descending");
+    function key(row) {
+      var cell = row.cells[column], number = cell.dataset.value;
+      return number === undefined ? cell.textContent : parseFloat(number);
+    }
+    Array.from(body.rows).sort(function (one, other) {
+      var a = key(one), b = key(other);
+      if (a === "" || b === "") return (a === "") - (b === "");
+      var order = typeof a === "number" && typeof b === "number"
+        ? a - b : String(a).localeCompare(String(b), undefined, { numeric: true });
+      return up ? order : -order;
+    }).forEach(function (row) { body.appendChild(row); });
+  });
+});
+"""
+
+
+def page(title: str, parts: Iterable[str]) -> str:
+    """A whole page of HTML parts.
+
+    :param title: text
+    :param parts: HTML
+    """
+    return (
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f"<title>{escape(title)}</title>\n<style>{STYLE}</style></head>\n"
+        f"<body>\n<h1>{escape(title)}</h1>\n"
+        + "\n".join(parts)
+        + f"\n<script>{SCRIPT}</script>\n</body></html>\n"
+    )
+
+
+def section(heading: str, *parts: str) -> str:
+    """A part under a heading of its own."""
+    body = "\n".join(parts)
+    return f"<section><h2>{escape(heading)}</h2>\n{body}\n</section>"
+
+
+def paragraph(text: str) -> str:
+    """A paragraph of text."""
+    return f"<p>{escape(text)}</p>"
+
+
+def listing(texts: Iterable[str]) -> str:
+    """A list of texts, an item each."""
+    return "<ul>" + "".join(f"<li>{escape(text)}</li>\n" for text in texts) + "</ul>"
+
+
+def folded(summary: str, *parts: str) -> str:
+    """Parts that show when their summary is clicked."""
+    return f"<details><summary>{escape(summary)}</summary>\n{''.join(parts)}</details>"
+
+
+def code(text: str) -> str:
+    """A block of code."""
+    return f"<pre><code>{escape(text)}</code></pre>"
+
+
+def link(address: str, text: str) -> str:
+    """A link with a text."""
+    return f'<a href="{escape(address)}">{escape(text)}</a>'
+
+
+def image(svg: bytes, alt: str) -> str:
+    """A picture inside the page itself; one that is wide scrolls rather than shrink to nothing."""
+    data = base64.b64encode(svg).decode()
+    points = re.search(rb'<svg[^>]* width="([0-9.]+)pt"', svg)
+    width = round(READABLE * float(points.group(1))) if points else 0
+    style = f"min-width: {width}px"
+    return f'<img alt="{escape(alt)}" style="{style}" src="data:image/svg+xml;base64,{data}">'
+
+
+def table(given: Table) -> str:
+    """A table that scrolls by itself and sorts by a click, or by keys, on its heads."""
+    heads = "".join(
+        f'<th scope="col" aria-sort="none"><button type="button">{escape(head)}</button></th>'
+        for head in given.heads
+    )
+    rows = "".join(f"<tr>{''.join(map(_cell, row))}</tr>\n" for row in given.rows)
+    return (
+        '<div class="scroll" tabindex="0" role="region" aria-label="table">'
+        f"<table><thead><tr>{heads}</tr></thead>\n<tbody>{rows}</tbody></table></div>"
+    )
+
+
+VERDICTS = {
+    "supported": "supported",
+    "contradicted": "contradicted",
+    "not enough data": "undecided",
+}
+
+
+def _cell(value: Any) -> str:
+    if value is None or (isinstance(value, float) and math.isnan(value)):
+        return "<td></td>"
+    if isinstance(value, (int, float)) and not isinstance(value, bool):
+        text = f"{value:,}" if isinstance(value, int) else f"{value:.4g}"
+        return f'<td class="number" data-value="{value!r}">{text}</td>'
+    text = str(value)
+    kind = VERDICTS.get(text) or ("wide" if len(text) > 40 else "")
+    return f'<td class="{kind}">{escape(text)}</td>' if kind else f"<td>{escape(text)}</td>"

@@ -1,0 +1,108 @@
+"""Scores on one scale over tasks: what is 0, what is 1, and where that is from."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from statistics import fmean
+
+from sb3_sparse.report.data import RunData
+from sb3_sparse.report.methods import DENSE
+from sb3_sparse.report.settings import ATARI, game_of, suite_of
+
+# (random play, professional human tester). Source: Mnih et al. 2015 (Nature 518:529), extended data
+# table 2. The table of DQN Zoo and rliable differs: its human scores are of a later tester.
+HUMAN = {
+    "Assault": (222.4, 1496.0),
+    "Asterix": (210.0, 8503.0),
+    "BeamRider": (363.9, 5775.0),
+    "Boxing": (0.1, 4.3),
+    "Breakout": (1.7, 31.8),
+    "CrazyClimber": (10781.0, 35411.0),
+    "DemonAttack": (152.1, 3401.0),
+    "Enduro": (0.0, 309.6),
+    "FishingDerby": (-91.7, 5.5),
+    "MsPacman": (307.3, 15693.0),
+    "Pong": (-20.7, 9.3),
+    "Qbert": (163.9, 13455.0),
+    "SpaceInvaders": (148.0, 1652.0),
+    "Tutankham": (11.4, 167.6),
+    "VideoPinball": (16257.0, 17298.0),
+}
+# (uniformly random policy, solved). Random: measured with Gymnasium 1.4, 500 to 5,000 episodes.
+# Solved: Gymnasium's reward threshold; Pendulum has none, -150 is about what trained agents reach.
+CONTROL_SCALE = {
+    "CartPole": (22.0, 475.0),
+    "Acrobot": (-499.0, -100.0),
+    "MountainCar": (-200.0, -110.0),
+    "Pendulum": (-1223.0, -150.0),
+}
+PAIRS = {
+    **{name: (*pair, "human-normalised, Mnih et al. 2015") for name, pair in HUMAN.items()},
+    **{name: (*pair, "random policy to solved") for name, pair in CONTROL_SCALE.items()},
+}
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Of one task.
+
+    :param zero: score that becomes 0
+    :param one: score that becomes 1
+    :param source: where they are from
+    """
+
+    zero: float
+    one: float
+    source: str
+
+    def __call__(self, score: float) -> float:
+        return (score - self.zero) / (self.one - self.zero)
+
+
+class Normaliser:
+    """A scale for each family and task that has one.
+
+    :param runs: of which the dense ones of full size give the scale where none is fixed
+    """
+
+    def __init__(self, runs: Iterable[RunData]) -> None:
+        self.scales: dict[tuple[str, str], Scale] = {}
+        self.missing: list[str] = []
+        trained = [run for run in runs if run.trained]
+        for family, env_id in sorted({(run.family, run.env_id) for run in trained}):
+            here = [run for run in trained if (run.family, run.env_id) == (family, env_id)]
+            scale = _fixed(env_id) or _by_dense(here)
+            if isinstance(scale, Scale):
+                self.scales[family, env_id] = scale
+            else:
+                self.missing.append(f"{family}, {env_id}: {scale}")
+
+    def __call__(self, run: RunData, score: float | None = None) -> float | None:
+        """A run's score, or another return of its task, normalised; None without a scale."""
+        scale = self.scales.get((run.family, run.env_id))
+        return None if scale is None else scale(run.score if score is None else score)
+
+    def statements(self) -> list[str]:
+        """What 0 and 1 stand for, a line a task."""
+        return [
+            f"{family}, {env_id}: 0 is {scale.zero:.6g}, 1 is {scale.one:.6g} ({scale.source})"
+            for (family, env_id), scale in self.scales.items()
+        ]
+
+
+def _fixed(env_id: str) -> Scale | None:
+    name = game_of(env_id)
+    if name in CONTROL_SCALE or (name in HUMAN and suite_of(env_id) == ATARI):
+        return Scale(*PAIRS[name])
+    return None
+
+
+def _by_dense(runs: list[RunData]) -> Scale | str:
+    scores = [run.score for run in runs if run.label == DENSE]
+    if not scores:
+        return "no run of the dense network of full size, whose mean score would be 1"
+    mean = fmean(scores)
+    if mean <= 0:
+        return f"the dense network's mean score is {mean:.6g}, by which nothing can be divided"
+    return Scale(0.0, mean, f"divided by the mean of {len(scores)} dense run(s) of full size")

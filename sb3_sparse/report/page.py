@@ -1,0 +1,182 @@
+"""What stands on a report's page, in order."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+
+from sb3_sparse.report import html
+from sb3_sparse.report.data import LeftOut
+from sb3_sparse.report.figures import FIGURES
+from sb3_sparse.report.study import Study
+from sb3_sparse.report.tables import Table, verdicts_table
+from sb3_sparse.report.verdicts import DECIDED, FINDINGS, LEAST_SEEDS, Verdict
+
+PAPER = "The State of Sparse Training in Deep Reinforcement Learning (arXiv:2206.10369)"
+HOW = (
+    "Score of a run: mean over the last 10 % of its evaluations. IQM, probability of improvement "
+    "and profiles: rliable, 95 % stratified bootstrap over runs with 2,000 resamples (profiles: "
+    "1,000) from a fixed seed. rliable needs as many runs of every task: each task gives its "
+    "lowest seeds, as many as the scarcest task has. These intervals are rliable's own and too "
+    "narrow for few seeds (they cover 75 to 90 % of truths at 3 to 5). Means of one cell: "
+    "Student's t; where figures would be all band, the bands are cut at their panel's edge. Where "
+    "a cell has runs of several settings, methods are compared by those that change the fewest "
+    "settings "
+    "of their config, then by those with most seeds."
+)
+INTERVALS = (
+    "Effect: difference of the two sides, with a 95 % stratified bootstrap interval, widened for "
+    "few seeds (by sqrt(n/(n-1)) and from normal to Student's t): with 3 seeds the plain "
+    "bootstrap is much too narrow. Each environment, or environment and sparsity, is a stratum. "
+    f"A stratum with fewer than {LEAST_SEEDS} seeds of either side does not count, and without "
+    "any there is no verdict. Several findings are tested at 95 % each, with no correction. "
+    '"Not enough data" is also said when the interval decides nothing.'
+)
+
+
+@dataclass(frozen=True)
+class Shown:
+    """One figure of the page.
+
+    :param name: in the table of figures
+    :param svg: None if it was left out
+    :param remarks: why it was, or what is not in it
+    """
+
+    name: str
+    svg: bytes | None
+    remarks: Sequence[str]
+
+
+@dataclass(frozen=True)
+class Content:
+    """All that the page says."""
+
+    title: str
+    study: Study
+    cells: Table
+    verdicts: Sequence[Verdict]
+    figures: Sequence[Shown]
+    left_out: Sequence[LeftOut]
+    pending: Sequence[str]
+    command: str
+
+
+def render(content: Content) -> str:
+    """The page's HTML."""
+    study = content.study
+    parts = [
+        html.paragraph(_counts(content)),
+        html.paragraph(f"Findings are those of {PAPER}."),
+        _verdicts(content),
+        html.section("Figures", *map(_figure, content.figures)),
+        html.section(
+            "All cells",
+            html.paragraph(
+                "IQM and interval over the seeds of one cell, in raw scores. Compared: whether "
+                "figures and verdicts that compare methods take these runs."
+            ),
+            html.table(content.cells),
+            f"<p>{html.link('cells.csv', 'cells.csv')}, {html.link('runs.csv', 'runs.csv')}, "
+            f"{html.link('verdicts.csv', 'verdicts.csv')}</p>",
+        ),
+        _normalisation(study),
+        _left_out(content),
+    ]
+    if content.pending or content.command:
+        parts.append(_pending(content))
+    parts.append(_versions(study))
+    return html.page(content.title, parts)
+
+
+def _counts(content: Content) -> str:
+    study = content.study
+    runs = study.trained
+    counted = len(study.runs) - len(runs)
+    steps = sum(run.steps for run in runs)
+    seeds = len({run.seed for run in runs})
+    envs = len({run.env_id for run in study.runs})
+    also = f", and {counted} only counted" if counted else ""
+    return (
+        f"Finished runs: {len(runs)}{also}; seeds: {seeds}; environments: {envs}; environment "
+        f"steps: {steps:,}; left out: {len(content.left_out)}; pending: {len(content.pending)}."
+    )
+
+
+def _verdicts(content: Content) -> str:
+    rules = [
+        f"{one.text} {one.rule}; {DECIDED[one.decide]}. At least {LEAST_SEEDS} seeds of both sides."
+        for one in FINDINGS
+    ]
+    return html.section(
+        "Verdicts on the paper's findings",
+        html.table(verdicts_table(content.verdicts)),
+        html.folded("Rules", html.paragraph(INTERVALS), html.listing(rules)),
+    )
+
+
+def _figure(shown: Shown) -> str:
+    entry = FIGURES[shown.name]
+    if shown.svg is None:
+        why = "; ".join(shown.remarks)
+        return f"<h3>{escape(entry.title)}</h3>\n" + html.paragraph(f"Left out: {why}.")
+    links = " ".join(
+        html.link(f"figures/{shown.name}.{kind}", kind.upper()) for kind in ("png", "svg", "csv")
+    )
+    missing = (
+        html.folded("Not in this figure", html.listing(shown.remarks)) if shown.remarks else ""
+    )
+    return (
+        f'<figure id="{escape(shown.name)}"><h3>{escape(entry.title)}</h3>\n'
+        f'<div class="frame">{html.image(shown.svg, f"{entry.title}: {entry.caption}")}</div>\n'
+        f"<figcaption>{escape(entry.caption)} {links}</figcaption>\n{missing}</figure>"
+    )
+
+
+def _normalisation(study: Study) -> str:
+    parts = [html.paragraph(HOW)]
+    if study.normaliser.scales:
+        parts.append(html.listing(study.normaliser.statements()))
+    if study.normaliser.missing:
+        parts.append(html.paragraph("Without a scale, so in no figure of normalised scores:"))
+        parts.append(html.listing(study.normaliser.missing))
+    parts.append(
+        html.paragraph(
+            "Scales: Atari by random play and human testers of Mnih et al. 2015; classic control "
+            "from a uniformly random policy, measured with Gymnasium 1.4, to Gymnasium's reward "
+            "threshold (Pendulum, which has none: -150); MuJoCo and all else divided by the mean "
+            "score of the dense network of full size of the same algorithm."
+        )
+    )
+    return html.section("Scores and normalisation", *parts)
+
+
+def _left_out(content: Content) -> str:
+    texts = [f"{one.folder}: {one.reason}" for one in content.left_out]
+    parts = [html.listing(texts) if texts else html.paragraph("No run folder was left out.")]
+    if content.study.remarks:
+        parts += [
+            html.paragraph("Cells with runs of several settings:"),
+            html.listing(content.study.remarks),
+        ]
+    return html.section("Left out", *parts)
+
+
+def _pending(content: Content) -> str:
+    parts = [html.paragraph(f"{len(content.pending)} cells are planned and not done.")]
+    if content.pending:
+        parts.append(html.folded("Which", html.listing(content.pending)))
+    if content.command:
+        parts += [html.paragraph("This continues it:"), html.code(content.command)]
+    return html.section("Pending", *parts)
+
+
+def _versions(study: Study) -> str:
+    found: dict[str, set[str]] = {}
+    for run in study.runs:
+        versions = run.record.get("versions")
+        for name, version in (versions if isinstance(versions, Mapping) else {}).items():
+            found.setdefault(str(name), set()).add(str(version))
+    texts = [f"{name} {' and '.join(sorted(versions))}" for name, versions in found.items()]
+    return html.section("Versions", html.listing(texts or ["none recorded"]))

@@ -1,0 +1,210 @@
+"""Interquartile means, probabilities of improvement and profiles by rliable; intervals of means.
+
+All intervals are called 95 %. What they cover of the truth, measured on 2,000 data sets of normal
+scores, each method with as many seeds:
+
+======  =====  ==================  =============  ==========================
+tasks   seeds  IQM (iqm_estimates)  plain difference  widened (difference)
+======  =====  ==================  =============  ==========================
+1       3      0.75                0.80           0.95
+1       5      0.90                0.94           0.98
+1       10     0.93                0.95           0.97
+5       3      0.87                0.88           0.96
+5       5      0.90                0.92           0.96
+5       10     0.92                0.93           0.95
+======  =====  ==================  =============  ==========================
+
+So verdicts rest on the widened one; the intervals of IQM figures are rliable's own, as published
+work draws them, and too narrow for few seeds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+
+from sb3_sparse.report.backend import rliable_library, student_t
+from sb3_sparse.report.data import Array
+
+REPS, SEED, LEAST = 2000, 0, 2
+NORMAL_975 = 1.959963984540054
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A number with its 95 % interval.
+
+    :param value: point estimate
+    :param low: lower end; nan where there are not enough data for an interval
+    :param high: upper end
+    :param seeds: runs of each task
+    :param tasks: tasks
+    """
+
+    value: float
+    low: float
+    high: float
+    seeds: int
+    tasks: int = 1
+
+
+@dataclass(frozen=True)
+class Rectangle:
+    """Scores as rliable wants them: as many runs of each task.
+
+    :param scores: shape ``[runs, tasks]``
+    :param tasks: names of the columns
+    :param remarks: what had to be left out for it
+    """
+
+    scores: Array
+    tasks: tuple[str, ...]
+    remarks: tuple[str, ...]
+
+
+def rectangle(by_task: Mapping[str, Sequence[float]], least: int = LEAST) -> Rectangle | None:
+    """The first k scores of each task, k being the smallest number of runs over tasks.
+
+    :param by_task: scores of each task in the order of seeds, so that no score decides
+    :param least: a task with fewer runs is left out, and named
+    :return: None if no task is left
+    """
+    full = {task: scores for task, scores in by_task.items() if len(scores) >= least}
+    remarks = [
+        f"{task}: {len(by_task[task])} run(s), of {least} needed"
+        for task in by_task
+        if task not in full
+    ]
+    if not full:
+        return None
+    count = min(map(len, full.values()))
+    unused = {task: len(scores) - count for task, scores in full.items() if len(scores) > count}
+    remarks += [
+        f"{task}: {more} run(s) of the highest seeds not used" for task, more in unused.items()
+    ]
+    scores = np.array([list(scores)[:count] for scores in full.values()], dtype=np.float64).T
+    return Rectangle(scores, tuple(full), tuple(remarks))
+
+
+def iqm(scores: Array) -> float:
+    """Mean of the middle half of all scores, shape ``[runs, tasks]``; as rliable's."""
+    ordered = np.sort(scores, axis=None)
+    cut = ordered.size // 4
+    return float(ordered[cut : ordered.size - cut].mean())
+
+
+def iqm_estimates(scores: Mapping[str, Array], reps: int = REPS) -> dict[str, Estimate]:
+    """Interquartile means with stratified bootstrap intervals.
+
+    :param scores: shape ``[runs, tasks]`` by method; two runs or more
+    """
+    return {
+        name: _bootstrap(one, lambda x: np.array([iqm(x)]), reps) for name, one in scores.items()
+    }
+
+
+def improvement(better: Array, worse: Array, reps: int = REPS) -> Estimate:
+    """Probability that a run of one method beats one of another, mean over tasks; ties count half.
+
+    :param better: shape ``[runs, tasks]``
+    :param worse: shape ``[runs, tasks]``, the same tasks
+    """
+
+    def probability(x: Array, y: Array) -> Array:  # rliable's metric, without a test per task
+        above, same = x[:, None] > y[None], x[:, None] == y[None]
+        return np.array([(above + 0.5 * same).mean()])
+
+    return _bootstrap((better, worse), probability, reps)
+
+
+def profile(scores: Array, taus: Array, reps: int = REPS) -> tuple[Array, Array, Array]:
+    """Share of runs with a score above each threshold, and the ends of its interval.
+
+    :param scores: shape ``[runs, tasks]``
+    :param taus: shape ``[n]``
+    """
+    with _seeded():
+        values, ends = rliable_library.create_performance_profile(
+            {"it": scores}, taus, custom_profile_func=_shares, reps=reps
+        )
+    return values["it"], ends["it"][0], ends["it"][1]
+
+
+def difference(
+    x: Array, y: Array, statistic: Callable[[Array], float] = iqm, reps: int = REPS
+) -> Estimate:
+    """By how much a method's statistic exceeds another's; the interval holds for few seeds.
+
+    The stratified bootstrap draws from n runs as if they were all there are, so its interval is too
+    narrow by sqrt((n - 1)/n), and normal where Student's t is due. Both ends are moved out by these
+    factors. Source: Hesterberg 2015 (arXiv:1411.5279), section 3.2, applied to the ends themselves,
+    because with 3 runs the tails of the bootstrap are too coarse to read wider quantiles off.
+
+    :param x: shape ``[runs, tasks]``
+    :param y: shape ``[runs of its own, the same tasks]``
+    """
+
+    def subtract(a: Array, b: Array) -> Array:
+        return np.array([statistic(a) - statistic(b)])
+
+    plain = _bootstrap((x, y), subtract, reps)
+    freedom = x.shape[1] * (len(x) + len(y) - 2)
+    least = min(len(x), len(y))
+    factor = np.sqrt(least / (least - 1)) * student_t.ppf(0.975, freedom) / NORMAL_975
+    low = plain.value - factor * (plain.value - plain.low)
+    high = plain.value + factor * (plain.high - plain.value)
+    return Estimate(plain.value, float(low), float(high), least, x.shape[1])
+
+
+def mean(values: Sequence[float]) -> Estimate:
+    """Mean over seeds with Student's t interval, which is right for few seeds; none for one."""
+    found, low, high = means(np.asarray(values, dtype=np.float64)[:, None])
+    return Estimate(float(found[0]), float(low[0]), float(high[0]), len(values))
+
+
+def means(values: Array) -> tuple[Array, Array, Array]:
+    """Mean over the first axis and the ends of its interval, pointwise.
+
+    :param values: shape ``[seeds, points]``
+    :return: each of shape ``[points]``; the ends are nan for one seed
+    """
+    count = len(values)
+    middle = values.mean(axis=0)
+    if count < LEAST:
+        nothing = np.full_like(middle, np.nan)
+        return middle, nothing, nothing
+    half = student_t.ppf(0.975, count - 1) * values.std(axis=0, ddof=1) / np.sqrt(count)
+    return middle, middle - half, middle + half
+
+
+def _shares(scores: Array, taus: Array) -> Array:
+    shares: Array = (scores.reshape(-1, 1) > taus).mean(axis=0)
+    return shares
+
+
+def _bootstrap(
+    scores: Array | tuple[Array, Array], statistic: Callable[..., Array], reps: int
+) -> Estimate:
+    first = scores if isinstance(scores, np.ndarray) else scores[0]
+    given = scores if isinstance(scores, np.ndarray) else list(scores)
+    with _seeded():
+        values, ends = rliable_library.get_interval_estimates({"it": given}, statistic, reps=reps)
+    low, high = ends["it"][:, 0]
+    return Estimate(float(values["it"][0]), float(low), float(high), len(first), first.shape[1])
+
+
+@contextmanager
+def _seeded() -> Iterator[None]:
+    """NumPy's global generator from a fixed seed, as it was afterwards.
+
+    rliable 1.2 takes a ``random_state`` but draws from the global generator.
+    """
+    before = np.random.get_state()
+    np.random.seed(SEED)
+    try:
+        yield
+    finally:
+        np.random.set_state(before)

@@ -1,0 +1,198 @@
+"""What the paper found, held against these runs: each finding's rule, effect, interval and n."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from sb3_sparse.report.comparisons import (
+    Sides,
+    by_distribution,
+    by_noise,
+    by_share,
+    by_snr,
+    by_weight_decay,
+    rigl_and_set,
+    sparse_and_dense,
+    sparse_and_equal,
+)
+from sb3_sparse.report.data import Array
+from sb3_sparse.report.statistics import difference, iqm, rectangle
+from sb3_sparse.report.study import Study
+
+SUPPORTED, CONTRADICTED, UNDECIDED = "supported", "contradicted", "not enough data"
+LEAST_SEEDS = 3
+NO_LOSS, SAME = 0.05, 0.1
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A sentence of the paper and how it is tested.
+
+    :param key: its name
+    :param text: what the paper found
+    :param rule: what is compared, and when it counts as supported or contradicted
+    :param sides: gives the scores of both sides by stratum
+    :param decide: ``"greater"``, ``"less"``, ``"no loss"`` or ``"same"``
+    :param statistic: of which the difference is taken
+    :param unit: of the effect
+    """
+
+    key: str
+    text: str
+    rule: str
+    sides: Callable[[Study, str], Sides]
+    decide: str
+    statistic: Callable[[Array], float]
+    unit: str
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """On one finding, for one family of runs.
+
+    :param family: algorithm, architecture and suite; empty if no family has data
+    :param verdict: supported, contradicted or not enough data
+    :param effect: difference; None if it could not be taken
+    :param low: lower end of its 95 % interval
+    :param high: upper end
+    :param seeds: runs of each stratum, on the scarcer side
+    :param strata: how many
+    :param remark: why there is no verdict, or what it leaves out
+    """
+
+    finding: Finding
+    family: str
+    verdict: str
+    effect: float | None = None
+    low: float | None = None
+    high: float | None = None
+    seeds: int = 0
+    strata: int = 0
+    remark: str = ""
+
+
+def _average(scores: Array) -> float:
+    return float(scores.mean())
+
+
+DECIDED = {
+    "greater": "supported if the interval lies above 0, contradicted if it lies below",
+    "less": "supported if the interval lies below 0, contradicted if it lies above",
+    "no loss": f"supported if the interval lies above -{NO_LOSS:.0%} of the dense IQM, "
+    "contradicted if it lies below that",
+    "same": f"supported if the interval lies within +-{SAME:.0%} of SET's IQM, contradicted if it "
+    "lies outside",
+}
+IQM_UNIT, MEAN_UNIT = "normalised IQM", "normalised mean"
+FINDINGS = (
+    Finding(
+        "equal-parameters",
+        "Sparse networks beat dense ones with as many parameters.",
+        "Pruning, SET and RigL (their mean) minus the parameter-equivalent dense network, at all "
+        "sparsities from 50 % on; each environment and sparsity is a stratum",
+        sparse_and_equal, "greater", iqm, IQM_UNIT,
+    ),
+    Finding(
+        "no-loss",
+        "80 to 90 % sparse networks lose nothing against the dense one of full size.",
+        "Pruning, SET and RigL at 80 to 90 % (mean over methods and sparsities) minus the dense "
+        "network of full size; each environment is a stratum",
+        sparse_and_dense, "no loss", iqm, IQM_UNIT,
+    ),
+    Finding(
+        "rigl-set",
+        "RigL's gradients gain little over SET's random growth.",
+        "RigL minus SET at 50 to 95 %; each environment and sparsity is a stratum",
+        rigl_and_set, "same", iqm, IQM_UNIT,
+    ),
+    Finding(
+        "erk",
+        "ERK is better than uniform sparsity.",
+        "ERK minus uniform, all else the same; each environment, method and sparsity is a stratum",
+        by_distribution, "greater", _average, MEAN_UNIT,
+    ),
+    Finding(
+        "critic",
+        "The critic needs the parameters more than the actor.",
+        "Runs whose actor has 20 % of the connections or less minus runs whose critic has, all "
+        "else the same; each environment, method and sparsity is a stratum",
+        by_share, "greater", _average, MEAN_UNIT,
+    ),
+    Finding(
+        "weight-decay",
+        "A small weight decay helps.",
+        "Weight decay above 0 and up to 1e-4 minus none, all else the same; each environment, "
+        "method and sparsity is a stratum",
+        by_weight_decay, "greater", _average, MEAN_UNIT,
+    ),
+    Finding(
+        "snr",
+        "The gradients' signal-to-noise ratio falls with sparsity.",
+        "Mean natural logarithm of the SNR over training at the highest sparsity minus that at the "
+        "lowest (dense is 0 %); each environment and network is a stratum",
+        by_snr, "less", _average, "log SNR",
+    ),
+    Finding(
+        "noise",
+        "Sparse networks bear observation noise better than dense ones with as many parameters.",
+        "What the upper half of the strengths of noise costs (mean normalised return minus that "
+        "without noise): sparse minus parameter-equivalent dense; each environment and sparsity "
+        "is a stratum",
+        by_noise, "greater", _average, MEAN_UNIT,
+    ),
+)  # fmt: skip
+
+
+def verdicts(study: Study) -> list[Verdict]:
+    """One for each finding and family with runs for it; "not enough data" where none has."""
+    found = []
+    for finding in FINDINGS:
+        given = [(family, finding.sides(study, family)) for family in study.families()]
+        known = [(family, sides) for family, sides in given if sides.x]
+        if not known:
+            why = "; ".join(dict.fromkeys(sides.why for _, sides in given)) or "no trained run"
+            found.append(Verdict(finding, "", UNDECIDED, remark=why))
+        found += [_verdict(finding, family, sides) for family, sides in known]
+    return found
+
+
+def _verdict(finding: Finding, family: str, sides: Sides) -> Verdict:
+    fit = [
+        stratum
+        for stratum in sides.x
+        if min(len(sides.x[stratum]), len(sides.y[stratum])) >= LEAST_SEEDS
+    ]
+    x = rectangle({stratum: sides.x[stratum] for stratum in fit}, LEAST_SEEDS)
+    y = rectangle({stratum: sides.y[stratum] for stratum in fit}, LEAST_SEEDS)
+    few = [stratum for stratum in sides.x if stratum not in fit]
+    remark = f"fewer than {LEAST_SEEDS} seeds of both sides: {', '.join(few)}" if few else ""
+    if x is None or y is None:
+        return Verdict(finding, family, UNDECIDED, remark=remark)
+    remark = "; ".join([*([remark] if remark else []), *dict.fromkeys((*x.remarks, *y.remarks))])
+    effect = difference(x.scores, y.scores, finding.statistic)
+    verdict, why = _decide(finding, effect.low, effect.high, finding.statistic(y.scores))
+    remark = "; ".join(text for text in (why, remark) if text)
+    return Verdict(
+        finding, family, verdict, effect.value, effect.low, effect.high, effect.seeds,
+        effect.tasks, remark,
+    )  # fmt: skip
+
+
+def _decide(finding: Finding, low: float, high: float, reference: float) -> tuple[str, str]:
+    if finding.decide == "greater":
+        return _of(low > 0, high < 0), ""
+    if finding.decide == "less":
+        return _of(high < 0, low > 0), ""
+    if reference <= 0:
+        return UNDECIDED, "the other side's IQM is not above 0, so no margin can be a share of it"
+    if finding.decide == "no loss":
+        margin = NO_LOSS * reference
+        return _of(low > -margin, high < -margin), f"margin {margin:.3g}"
+    margin = SAME * reference
+    outside = low > margin or high < -margin
+    return _of(low > -margin and high < margin, outside), f"margin {margin:.3g}"
+
+
+def _of(supported: bool, contradicted: bool) -> str:
+    return SUPPORTED if supported else CONTRADICTED if contradicted else UNDECIDED

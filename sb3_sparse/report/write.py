@@ -1,0 +1,73 @@
+"""Write a report: one page, its figures, and the numbers behind them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from sb3_sparse.errors import ConfigError
+from sb3_sparse.report.data import read_runs
+from sb3_sparse.report.figures import NotEnoughData, check_figures, draw, save
+from sb3_sparse.report.page import Content, Shown, render
+from sb3_sparse.report.study import Study
+from sb3_sparse.report.tables import cells_table, runs_table, verdicts_table, write_csv
+from sb3_sparse.report.verdicts import verdicts
+
+FOLDER = "figures"
+KINDS = ("png", "svg", "csv")
+
+
+def write_report(
+    folders: Iterable[Path | str],
+    out: Path | str,
+    *,
+    title: str,
+    figures: Sequence[str],
+    varies: str | None = None,
+    command: str = "",
+    pending: Sequence[str] = (),
+) -> Path:
+    """Write a report on run folders.
+
+    It makes ``index.html``, which opens from disk without a network, ``cells.csv``, ``runs.csv``,
+    ``verdicts.csv``, and ``figures/<name>`` as PNG, SVG and CSV. Figures that these runs do not
+    give are left out with a reason on the page. The same runs give the same bytes.
+
+    :param folders: of runs; what cannot be used is named on the page
+    :param out: folder to write to
+    :param title: of the page
+    :param figures: names of the figures, in order
+    :param varies: setting that was varied, for the figure ``"sensitivity"``
+    :param command: continues what is pending
+    :param pending: cells that are planned and not done
+    :return: the page
+    :raises ConfigError: for an unknown figure, or an ``out`` that is no folder
+    """
+    check_figures(figures)
+    out = Path(out)
+    if out.exists() and not out.is_dir():
+        raise ConfigError(f"the report goes into a folder, and {out} is a file; give another name")
+    runs, left_out = read_runs(folders)
+    study = Study(tuple(runs), varies)
+    found = verdicts(study)
+    out.mkdir(parents=True, exist_ok=True)
+    shown = [_figure(name, study, out / FOLDER) for name in dict.fromkeys(figures)]
+    cells = cells_table(study)
+    write_csv(cells, out / "cells.csv")
+    write_csv(runs_table(study), out / "runs.csv")
+    write_csv(verdicts_table(found), out / "verdicts.csv")
+    page = out / "index.html"
+    content = Content(title, study, cells, found, shown, left_out, tuple(pending), command)
+    page.write_text(render(content), encoding="utf-8")
+    return page
+
+
+def _figure(name: str, study: Study, folder: Path) -> Shown:
+    try:
+        drawing = draw(name, study)
+    except NotEnoughData as error:
+        for kind in KINDS:  # an older report's, which these runs do not give
+            (folder / f"{name}.{kind}").unlink(missing_ok=True)
+        return Shown(name, None, [str(error)])
+    save(name, drawing, folder)
+    return Shown(name, (folder / f"{name}.svg").read_bytes(), list(drawing.remarks))

@@ -1,0 +1,171 @@
+"""Dormant units, effective ranks and the history of masks, by hand."""
+
+from __future__ import annotations
+
+import csv
+
+import numpy as np
+import pytest
+import torch as th
+from support import make
+
+from sb3_sparse import SparsityCallback
+from sb3_sparse.analysis import (
+    PlasticityCallback,
+    dormant_share,
+    effective_rank,
+    effective_ranks,
+)
+from sb3_sparse.analysis.activity import activity
+from sb3_sparse.analysis.maskhistory import MaskHistory
+from sb3_sparse.errors import ConfigError, CorruptStateError
+from sb3_sparse.topology import Exchange
+
+
+def q_net_by_hand(rows):
+    """A Q network whose one hidden layer has these weights and no biases."""
+    model = make("DQN", policy="MlpPolicy", policy_kwargs={"net_arch": [len(rows)]})
+    with th.no_grad():
+        for parameter in model.policy.parameters():
+            parameter.zero_()
+        model.policy.q_net.q_net[0].weight.copy_(th.tensor(rows))
+    return model
+
+
+UNITS = [[4.0, 0, 0, 0], [0, 1.0, 0, 0], [-1.0, 0, 0, 0], [0, 0, 0.08, 0]]
+
+
+def test_dormant_units_by_hand():
+    model = q_net_by_hand(UNITS)
+    observations = np.array([[1, 2, 1, 0], [1, 0, 1, 0]], np.float32)
+    # Mean activations 4, 1, 0 and 0.08; the layer's mean is 1.27, and 0.08 / 1.27 = 0.063
+    assert dormant_share(model, observations).overall == 0.25
+    assert dormant_share(model, observations, tau=0.07).networks == {"q_net": 0.5}
+    assert dormant_share(model.policy, observations, tau=0.0).overall == 0.25
+    assert dormant_share(model, np.zeros((3, 4), np.float32)).overall == 1.0
+
+
+def test_features_of_the_output_layer_by_hand():
+    model = q_net_by_hand(UNITS)
+    observations = np.array([[1, 2, 1, 0], [1, 0, 1, 0]], np.float32)
+    (features,) = activity(model, observations)["q_net"].features
+    np.testing.assert_allclose(features, [[4, 2, 0, 0.08], [4, 0, 0, 0.08]], rtol=1e-6)
+    assert effective_ranks(model, observations) == {"q_net": 2.0}
+
+
+def test_effective_rank_by_hand():
+    assert effective_rank(np.diag([90.0, 9.0, 1.0])) == 2  # 99 of 100
+    assert effective_rank(np.diag([90.0, 8.9, 1.1])) == 3
+    assert effective_rank(np.diag([90.0, 9.0, 1.0]), delta=0.1) == 1
+    assert effective_rank(np.outer([1, 2, 3], [4, 5])) == 1
+    assert effective_rank(np.zeros((3, 2))) == 0
+    with pytest.raises(ConfigError, match="shape"):
+        effective_rank(np.zeros(3))
+
+
+def test_many_observations_are_run_in_parts():
+    model = make("SAC")
+    observations = np.random.default_rng(0).normal(size=(300, 3)).astype(np.float32)
+    whole = activity(model, observations)
+    parts = [activity(model, observations[i : i + 100]) for i in (0, 100, 200)]
+    for network in ("actor", "critic"):
+        for i, units in enumerate(whole[network].activations):
+            mean = np.mean([part[network].activations[i] for part in parts], axis=0)
+            np.testing.assert_allclose(units, mean, rtol=1e-5, atol=1e-7)
+    assert [len(whole[n].features) for n in ("actor", "critic")] == [1, 2]  # heads, twins
+
+
+@pytest.mark.parametrize("compute", ["masked", "sparse"])
+def test_compact_networks_show_what_masked_ones_do(compute):
+    model = make("SAC", policy_kwargs={"compute": compute})
+    observations = np.linspace(-1, 1, 60, dtype=np.float32).reshape(20, 3)
+    (features,) = activity(model, observations)["actor"].features
+    with th.no_grad():
+        latent = model.actor.latent_pi(th.from_numpy(observations))
+    np.testing.assert_allclose(features, latent.numpy(), rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["TD3", "A2C", "QRDQN", "TQC", "CrossQ"])
+def test_other_algorithms_work_and_images_have_channels_as_units(name):
+    model = make(name)
+    model.learn(40, callback=PlasticityCallback(10))
+    images = make("DQN", "TinyImages-v0", policy_kwargs={"net_arch": []})
+    shape = (2, *images.observation_space.shape)
+    units = activity(images, np.ones(shape, np.uint8))["q_net"].activations
+    assert [len(layer) for layer in units] == [32, 64, 64, 512]
+
+
+def test_what_has_no_units_says_so():
+    model = make("DQN", policy_kwargs={"net_arch": []})
+    with pytest.raises(ConfigError, match="no units"):
+        dormant_share(model, np.ones((2, 4), np.float32))
+    assert effective_ranks(model, np.ones((2, 4), np.float32)) == {"q_net": 1.0}
+
+
+def move(layer, count=1):
+    """Drop the first active connections and grow the first inactive ones."""
+    mask = layer.mask()
+    dropped, grown = np.flatnonzero(mask)[:count], np.flatnonzero(~mask)[:count]
+    layer.move(Exchange(dropped, grown))
+
+
+def network_of(name="DQN"):
+    model = make(name, policy_kwargs={"distribution": "uniform", "net_arch": [10]})
+    (network,) = model.policy.sparse.networks
+    return network  # 40 and 20 connections, 4 and 2 of them active
+
+
+def test_churn_and_exploration_by_hand(tmp_path):
+    network = network_of()
+    history = MaskHistory([network], 0, tmp_path / "masks.npz")
+    assert history.look(10) == {"q_net": (0.0, 0.1)}
+    move(network.layers[0], 3)
+    assert history.look(20) == {"q_net": (6 / 60, 9 / 60)}
+    move(network.layers[1])
+    move(network.layers[1])  # what was grown goes again, and one more is explored unseen
+    explored = history.look(30)["q_net"][1]
+    assert 9 / 60 < explored <= 11 / 60
+    assert history.look(40) == {"q_net": (0.0, explored)}
+
+
+def test_a_history_goes_on_where_the_model_does(tmp_path):
+    path = tmp_path / "masks.npz"
+    network = network_of()
+    history = MaskHistory([network], 0, path)
+    move(network.layers[0], 2)
+    history.look(10)
+    move(network.layers[0], 1)
+    assert MaskHistory([network], 15, path).look(20)["q_net"] == history.look(20)["q_net"]
+    move(network.layers[1], 1)
+    history.look(30)
+    behind = MaskHistory([network], 20, path)  # the file is ahead of this model
+    move(network.layers[1], 0)
+    churn, explored = behind.look(30)["q_net"]
+    assert (churn, explored) == (0.0, history.look(40)["q_net"][1])
+    with pytest.warns(UserWarning, match="count from step 5"):
+        MaskHistory([network], 5, tmp_path / "absent.npz")
+    other = make("DQN").policy.sparse.networks
+    with pytest.raises(CorruptStateError, match="other layers"):
+        MaskHistory(other, 30, path)
+
+
+def test_the_callback_writes_all_measures_and_resumes(tmp_path):
+    path = tmp_path / "plasticity.csv"
+    model = make("SAC")
+    callbacks = [SparsityCallback("set", update_interval=10), PlasticityCallback(25, path)]
+    model.learn(100, callback=callbacks)
+    model.learn(50, callback=PlasticityCallback(25, path), reset_num_timesteps=False)
+    with path.open() as file:
+        rows = [(int(r["timesteps"]), r["name"], float(r["value"])) for r in csv.DictReader(file)]
+    names = {name for _, name, _ in rows}
+    kinds = ("dormant", "effective_rank", "mask_churn", "exploration")
+    assert names == {"plasticity/dormant"} | {
+        f"plasticity/{kind}/{network}" for kind in kinds for network in ("actor", "critic")
+    }
+    explored = [v for t, name, v in rows if name == "plasticity/exploration/critic"]
+    assert len(explored) == 6
+    assert 0.1 < explored[0] < explored[3] == explored[4] == explored[5]
+    assert (tmp_path / "plasticity.masks.npz").exists()
+    stock = make("DQN", policy="MlpPolicy")
+    stock.learn(60, callback=PlasticityCallback(25, path))
+    assert "exploration" not in path.read_text()

@@ -1,0 +1,201 @@
+"""Studies run to their end, also after what goes wrong."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import shutil
+import zipfile
+from collections.abc import Sequence
+
+import pytest
+import torch as th
+import yaml
+
+from sb3_sparse.experiments import Study, run_study, standing_of
+from sb3_sparse.experiments.work import work_on
+from sb3_sparse.launch.base import Ended, Launcher, Task
+from sb3_sparse.zoo.record import read_record
+
+QUICK = {
+    "n_timesteps": 300,
+    "eval_freq": 100,
+    "eval_episodes": 1,
+    "hyperparams": {"learning_starts": 100, "net_arch": [8], "batch_size": 16},
+}
+RUNS = [{"method": "dense"}, {"method": "static", "sparsity": 0.5}]
+
+
+class Here(Launcher):
+    """Runs the tasks in this process, one after another; fails those named, so many times."""
+
+    def __init__(self, fails=None):
+        self.fails = fails or {}
+        self.called = []
+
+    def run(self, tasks: Sequence[Task], workers: int):
+        for task in tasks:
+            self.called.append(task.name)
+            if self.fails.get(task.name, 0) > 0:
+                self.fails[task.name] -= 1
+                yield Ended(task, error="Traceback: it broke")
+            else:
+                yield Ended(task, value=task())
+
+
+def study(tmp_path, name="mine", **changed):
+    path = tmp_path / f"{name}.yml"
+    content = {
+        "title": "T",
+        "figures": ["iqm"],
+        "common": {"algo": "dqn", "env_id": "CartPole-v1"},
+        "runs": RUNS,
+        "scales": {"smoke": QUICK},
+    }
+    path.write_text(yaml.safe_dump({**content, **changed}))
+    return Study.read(str(path), "smoke")
+
+
+def finish(what, store, launcher=None):
+    *_, last = run_study(what, store, launcher or Here(), 1)
+    return last
+
+
+def weights(folder):
+    with zipfile.ZipFile(folder / "CartPole-v1.zip") as file:
+        return th.load(io.BytesIO(file.read("policy.pth")), weights_only=True)
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A study of two runs that are done."""
+    folder = tmp_path_factory.mktemp("trained")
+    made = study(folder)
+    last = finish(made, folder / "store")
+    assert (last.done, last.planned, last.failed) == (2, 2, {})
+    return made, folder / "store"
+
+
+def test_runs_lie_in_folders_that_their_content_names(trained):
+    made, store = trained
+    for cell in made.cells:
+        folder = store / "runs" / "dqn" / f"CartPole-v1_{cell.address}"
+        assert read_record(folder)["status"] == "finished"
+        assert (folder / "evaluations.npz").is_file()
+        assert standing_of(cell, store).status == "done"
+
+
+def test_a_cell_that_is_done_is_never_run_again_nor_by_another_study(trained, tmp_path):
+    _, store = trained
+    other = study(tmp_path, "other", runs=[*RUNS, {"method": "static", "sparsity": 0.75}])
+    copy = tmp_path / "store"
+    shutil.copytree(store, copy)
+    launcher = Here()
+    last = finish(other, copy, launcher)
+    assert len(launcher.called) == 1
+    assert "75%" in launcher.called[0]
+    assert last.done == 3
+
+
+def test_an_interrupted_cell_goes_on_and_a_lost_folder_begins_anew(trained, tmp_path):
+    made, store = trained
+    copy = tmp_path / "store"
+    shutil.copytree(store, copy)
+    first, second = (cell.folder(copy) for cell in made.cells)
+    record = json.loads((first / "sparsity.json").read_text())
+    record.update(status="evaluating", trained=True)
+    (first / "sparsity.json").write_text(json.dumps(record))
+    before = weights(first)
+    (second / "sparsity.json").unlink()  # a process that was killed at its very start
+    assert [standing_of(c, copy).status for c in made.cells] == ["stopped", "waiting"]
+    assert finish(made, copy).done == 2
+    assert all(th.equal(value, before[name]) for name, value in weights(first).items())
+    assert read_record(second)["status"] == "finished"
+
+
+def test_a_failed_cell_is_tried_once_more_after_the_others(tmp_path):
+    made = study(tmp_path, trained=False)
+    names = [cell.name for cell in made.cells]
+    launcher = Here({names[0]: 1})
+    last = finish(made, tmp_path / "store", launcher)
+    assert launcher.called == [names[0], names[1], names[0]]
+    assert (last.done, last.failed, last.retried) == (2, {}, [names[0]])
+    assert not made.cells[0].errors(tmp_path / "store").exists()
+
+
+def test_a_cell_that_fails_twice_is_reported_with_its_traceback_and_the_others_go_on(tmp_path):
+    made = study(tmp_path, trained=False)
+    names = [cell.name for cell in made.cells]
+    store = tmp_path / "store"
+    last = finish(made, store, Here({names[0]: 2}))
+    assert last.failed == {names[0]: "Traceback: it broke"}
+    assert last.done == 1
+    assert standing_of(made.cells[0], store).status == "failed"
+    assert made.cells[0].errors(store).read_text().count("Traceback: it broke") == 2
+    again = finish(made, store)  # the next start tries it anew
+    assert (again.done, again.failed) == (2, {})
+
+
+def test_a_cell_that_another_process_trains_is_left_to_it(tmp_path):
+    from sb3_sparse.zoo.checkpoint import locked
+    from sb3_sparse.zoo.record import write_record
+
+    made = study(tmp_path)
+    store = tmp_path / "store"
+    folder = made.cells[0].folder(store)
+    folder.mkdir(parents=True)
+    write_record(folder, status="running", num_timesteps=7)
+    with locked(folder):
+        assert standing_of(made.cells[0], store).status == "running"
+        assert work_on(made.cells[0], store) == "running"
+    assert read_record(folder)["num_timesteps"] == 7
+
+
+def test_counted_cells_have_sizes_and_no_model(tmp_path):
+    uniform = {"method": "static", "sparsity": 0.5, "distribution": "uniform"}
+    made = study(tmp_path, trained=False, runs=[RUNS[0], uniform])
+    finish(made, tmp_path / "store")
+    sparse = read_record(made.cells[1].folder(tmp_path / "store"))
+    assert sparse["status"] == "counted"
+    # 4-8-2: 32 + 16 weights, half of them active, and ten biases
+    assert sparse["total"]["nnz"] == 24
+    assert sparse["total"]["parameters"] == 34
+    assert not list(made.cells[1].folder(tmp_path / "store").glob("*.zip"))
+
+
+def test_noise_is_measured_of_the_trained_model_without_training_it_again(trained, tmp_path):
+    _, store = trained
+    copy = tmp_path / "store"
+    shutil.copytree(store, copy)
+    noisy = study(tmp_path, measures={"noise": {"sigmas": [0, 2], "n_episodes": 3}})
+    folder = noisy.cells[1].folder(copy)
+    before = (folder / "CartPole-v1.zip").stat().st_mtime_ns
+    assert standing_of(noisy.cells[1], copy).status == "stopped"
+    finish(noisy, copy)
+    assert (folder / "CartPole-v1.zip").stat().st_mtime_ns == before
+    with (folder / "robustness.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [float(row["sigma"]) for row in rows] == [0.0] * 3 + [2.0] * 3
+    assert all(1 <= float(row["return"]) <= 500 for row in rows)
+    assert standing_of(noisy.cells[1], copy).status == "done"
+
+
+def test_what_is_measured_during_training_lies_beside_the_evaluations(tmp_path):
+    measures = {"snr": {"every": 100}, "plasticity": {"every": 100}}
+    made = study(tmp_path, runs=RUNS[1:], measures=measures)
+    finish(made, tmp_path / "store")
+    folder = made.cells[0].folder(tmp_path / "store")
+    for name in ("snr", "plasticity"):
+        with (folder / f"{name}.csv").open() as file:
+            steps = {int(float(row["timesteps"])) for row in csv.DictReader(file)}
+        assert max(steps) == 300
+
+
+def test_time_left_is_of_the_cells_still_to_come(tmp_path):
+    made = study(tmp_path, trained=False)
+    seen = [
+        (p.done, p.open, p.seconds_left is None)
+        for p in run_study(made, tmp_path / "store", Here(), 1)
+    ]
+    assert seen == [(0, 2, True), (1, 1, False), (2, 0, False)]

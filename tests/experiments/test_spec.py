@@ -1,0 +1,162 @@
+"""Studies as they stand in their files."""
+
+from __future__ import annotations
+
+import pytest
+import yaml
+
+from sb3_sparse.errors import ConfigError
+from sb3_sparse.experiments import Study, study_names
+from sb3_sparse.experiments.spec import SCALES
+
+MINIMAL = {
+    "title": "A title",
+    "figures": ["iqm"],
+    "common": {"algo": "dqn", "env_id": ["CartPole-v1", "Acrobot-v1"]},
+    "runs": [
+        {"method": "dense"},
+        {"method": ["set", "rigl"], "sparsity": [0.5, 0.9]},
+    ],
+    "scales": {"smoke": {"seeds": 2, "n_timesteps": 100}},
+}
+
+
+def read(tmp_path, **changed):
+    path = tmp_path / "mine.yml"
+    path.write_text(yaml.safe_dump({**MINIMAL, **changed}))
+    return Study.read(str(path), "smoke")
+
+
+def test_every_combination_of_the_lists_is_a_cell_once_a_seed(tmp_path):
+    study = read(tmp_path)
+    assert len(study.cells) == 2 * 2 * (1 + 2 * 2)  # seeds, environments, dense and four sparse
+    runs = [cell.run for cell in study.cells]
+    assert len({(r.env_id, r.method, r.sparsity, r.seed) for r in runs}) == 20
+    assert {r.n_timesteps for r in runs} == {100}
+
+
+def test_first_seeds_come_first(tmp_path):
+    seeds = [cell.run.seed for cell in read(tmp_path).cells]
+    assert seeds == sorted(seeds)
+
+
+def test_the_same_cell_has_the_same_address_in_every_study(tmp_path):
+    other = read(tmp_path, title="Another", runs=[{"method": "rigl", "sparsity": 0.9}])
+    theirs = {cell.address for cell in other.cells}
+    assert len(theirs) == 4
+    assert theirs < {cell.address for cell in read(tmp_path).cells}
+
+
+def test_a_setting_that_the_config_has_anyway_changes_no_address(tmp_path):
+    plain = read(tmp_path, runs=[{"method": "rigl", "sparsity": 0.9}])
+    said = read(
+        tmp_path,
+        runs=[{"method": "rigl", "sparsity": 0.9, "hyperparams": {"update_interval": 1000}}],
+    )
+    assert [cell.address for cell in plain.cells] == [cell.address for cell in said.cells]
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"scales": {"smoke": {"seeds": 2, "n_timesteps": 101}}},
+        {"measures": {"snr": {"every": 50}}},
+        {"trained": False},
+        {"common": {**MINIMAL["common"], "hyperparams": {"gamma": 0.9}}},
+    ],
+)
+def test_what_decides_the_outcome_changes_every_address(tmp_path, changed):
+    one = {cell.address for cell in read(tmp_path).cells}
+    assert one.isdisjoint(cell.address for cell in read(tmp_path, **changed).cells)
+
+
+def test_what_is_measured_of_the_trained_model_is_no_part_of_the_address(tmp_path):
+    noisy = read(tmp_path, measures={"noise": {"sigmas": [0, 1]}})
+    assert [c.address for c in noisy.cells] == [c.address for c in read(tmp_path).cells]
+
+
+def test_what_varies_is_a_hyperparameter_of_each_run(tmp_path):
+    study = read(tmp_path, runs=[{"method": "dense", "vary": {"weight_decay": [0.0, 1e-4]}}])
+    decays = [cell.run.settings()["policy_kwargs"]["weight_decay"] for cell in study.cells]
+    assert sorted(set(decays)) == [0.0, 1e-4]
+    assert len(study.cells) == 2 * 2 * 2
+
+
+def test_a_scale_leaves_out_sparsities_methods_and_environments(tmp_path):
+    scales = {"smoke": {"sparsity": [0.9], "method": ["dense", "rigl"], "env_id": ["CartPole-v1"]}}
+    runs = [cell.run for cell in read(tmp_path, scales=scales).cells]
+    assert [(r.env_id, r.method, r.sparsity) for r in runs] == [
+        ("CartPole-v1", "dense", None),
+        ("CartPole-v1", "rigl", 0.9),
+    ]
+
+
+def test_a_scales_schedule_is_for_masks_that_move(tmp_path):
+    scales = {"smoke": {"schedule": {"update_interval": 7}}}
+    runs = [cell.run for cell in read(tmp_path, scales=scales).cells]
+    assert all(r.hyperparams == {} for r in runs if r.method == "dense")
+    assert all(r.hyperparams == {"update_interval": 7} for r in runs if r.method != "dense")
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"runs": [{"method": "rigl", "sparsitty": 0.9}]}, "unknown keys sparsitty"),
+        ({"colour": "red"}, "unknown keys colour"),
+        ({"scales": {"small": {}}}, "has no scale 'smoke', only small"),
+        ({"scales": {"smoke": {"seeds": 0}}}, "seeds must be a number, 1 or more, got 0"),
+        ({"measures": {"temperature": {}}}, "unknown measure 'temperature'"),
+        ({"measures": {"snr": {"often": 3}}}, "measure snr takes every"),
+        ({"runs": [{"method": "dense", "vary": {"gamma": 0.9}}]}, "vary must map"),
+        ({"runs": [{"method": "dense", "vary": {"gama": [0.9]}}]}, "did you mean 'gamma'"),
+        ({"runs": [{"method": "dense", "sparsity": 0.9}]}, "dense training has no sparsity"),
+    ],
+)
+def test_mistakes_are_named_with_the_file(tmp_path, changed, said):
+    with pytest.raises(ConfigError, match="mine.yml") as caught:
+        read(tmp_path, **changed)
+    assert said in str(caught.value)
+
+
+def test_an_unknown_study_is_answered_with_all_names():
+    with pytest.raises(ConfigError, match="classic_control"):
+        Study.read("figure_7", "small")
+
+
+def test_every_study_of_the_issue_is_shipped():
+    assert set(study_names()) == {
+        *("sac", "ppo", "dqn_cnn", "dqn_resnet", "classic_control"),
+        *("parameters_sac", "parameters_ppo", "parameters_dqn"),
+        *("actor_critic", "distribution", "weight_decay", "initialisation", "drop_fraction"),
+        *("update_interval", "batch_size", "last_layer_dense", "snr", "noise", "flops"),
+    }
+
+
+@pytest.mark.parametrize("name", study_names())
+@pytest.mark.parametrize("scale", SCALES)
+def test_every_shipped_study_reads_at_every_scale(name, scale):
+    study = Study.read(name, scale)
+    assert study.cells
+    assert study.title
+    smoke, paper = len(Study.read(name, "smoke").cells), len(Study.read(name, "paper").cells)
+    assert smoke <= paper
+
+
+def test_the_papers_seeds_steps_and_evaluations_are_the_configs_own():
+    study = Study.read("sac", "paper")
+    assert {cell.run.seed for cell in study.cells} == set(range(10))
+    for cell in study.cells[:20]:
+        assert cell.run.settings()["n_timesteps"] == 1_000_000
+        assert cell.run.evaluation() == {"eval_freq": 10_000, "eval_episodes": 30}
+
+
+def test_dense_widths_of_the_actor_critic_study_keep_their_budget():
+    """Kernels of HalfCheetah's SAC (17 observations, 6 actions, two critics), counted by hand."""
+    for cell in Study.read("actor_critic", "small").cells:
+        arch = cell.run.hyperparams.get("net_arch")
+        if arch is None:
+            continue
+        pi, qf = arch["pi"][0], arch["qf"][0]
+        total = 17 * pi + pi * pi + 12 * pi + 2 * (23 * qf + qf * qf + qf)
+        dense = 17 * 256 + 256 * 256 + 12 * 256 + 2 * (23 * 256 + 256 * 256 + 256)
+        assert min(abs(total / dense - budget) for budget in (1.0, 0.2, 0.1)) < 0.01

@@ -1,0 +1,173 @@
+from __future__ import annotations
+
+import json
+import zipfile
+
+import numpy as np
+import pytest
+
+from sb3_sparse.report import read_runs
+from sb3_sparse.report.figures.curves import aligned
+from sb3_sparse.report.normalisation import HUMAN, Normaliser
+from sb3_sparse.report.study import Study
+
+
+def reasons(folders):
+    runs, out = read_runs(folders)
+    return runs, {one.folder: one.reason for one in out}
+
+
+def test_a_finished_run_is_read_with_its_score(folders):
+    folder = folders.add(seed=3, score=[0.0] * 19 + [10.0])  # 20 evaluations: the last two count
+    runs, out = reasons([folder])
+    assert not out
+    assert (runs[0].label, runs[0].level, runs[0].seed, runs[0].trained) == ("rigl", 0.9, 3, True)
+    assert runs[0].score == 5.0
+    assert runs[0].family == "DQN on classic control"
+
+
+def test_a_smaller_dense_network_has_a_label_of_its_own(folders):
+    folders.add("dense", None)
+    folders.add("dense", None, match=0.9)
+    runs, _ = read_runs(folders.made)
+    assert [(run.label, run.level) for run in runs] == [("dense", 0.0), ("dense-equal", 0.9)]
+
+
+@pytest.mark.parametrize("status", ["running", "evaluating", "interrupted", "failed"])
+def test_an_unfinished_run_is_named(folders, status):
+    folder = folders.add(status=status)
+    runs, out = reasons([folder])
+    assert not runs
+    assert ("failed" if status == "failed" else status) in out[folder]
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (lambda f: (f / "sparsity.json").write_text('{"status": "fin'), "damaged"),
+        (lambda f: (f / "sparsity.json").write_text("[]"), "no mapping"),
+        (lambda f: (f / "sparsity.json").write_bytes(b"\xff\xfe\x00"), "cannot be read"),
+        (lambda f: (f / "sparsity.json").unlink(), "no run of sb3-sparse"),
+        (lambda f: (f / "evaluations.npz").unlink(), "evaluations.npz is missing"),
+        (lambda f: (f / "evaluations.npz").write_bytes(b"PK\x03\x04 half"), "damaged"),
+        (lambda f: (f / "evaluations.npz").write_bytes(b""), "damaged"),
+        (lambda f: np.savez(f / "evaluations.npz", timesteps=[1], results=[[np.nan]]), "finite"),
+        (lambda f: np.savez(f / "evaluations.npz", timesteps=[1, 2], results=[[1.0]]), "damaged"),
+        (lambda f: np.savez(f / "evaluations.npz", timesteps=[], results=[]), "damaged"),
+    ],
+)
+def test_a_broken_folder_is_named_and_the_others_are_read(folders, spoil, said):
+    good, bad = folders.add(seed=0), folders.add(seed=1)
+    spoil(bad)
+    runs, out = reasons([good, bad])
+    assert [run.folder for run in runs] == [good]
+    assert said in out[bad]
+
+
+@pytest.mark.parametrize("part", ["total", "settings", "layers", "run"])
+def test_a_record_that_lacks_a_part_is_named(folders, part):
+    folder = folders.add()
+    record = json.loads((folder / "sparsity.json").read_text())
+    del record[part]
+    (folder / "sparsity.json").write_text(json.dumps(record))
+    _, out = reasons([folder])
+    assert part in out[folder]
+
+
+def test_a_missing_folder_is_named(tmp_path):
+    _, out = reasons([tmp_path / "nowhere"])
+    assert "no such folder" in out[tmp_path / "nowhere"]
+
+
+def test_a_duplicate_is_named_but_another_seed_is_not(folders):
+    first, again, other = folders.add(seed=0), folders.add(seed=0), folders.add(seed=1)
+    runs, out = reasons(folders.made)
+    assert [run.folder for run in runs] == [first, other]
+    assert str(first) in out[again]
+
+
+def test_a_damaged_measurement_is_named_and_the_run_stays(folders):
+    folder = folders.add()
+    (folder / "snr.csv").write_text("timesteps,name,value\n100,snr/q_net,abc\n")
+    runs, out = reasons([folder])
+    assert len(runs) == 1
+    assert "snr.csv" not in runs[0].measured
+    assert "line 2" in out[folder]
+
+
+def test_curves_of_other_steps_are_named_and_not_averaged(folders):
+    for seed, evaluations in enumerate((10, 10, 7)):
+        folders.add(seed=seed, score=float(seed), evaluations=evaluations)
+    runs, out = read_runs(folders.made)
+    assert not out
+    steps, values, remarks = aligned(runs)
+    assert (len(steps), values.shape) == (10, (2, 10))
+    assert str(folders.made[2]) in remarks[0]
+    assert runs[2].score == 2.0
+
+
+def test_no_two_settings_are_averaged_and_the_least_changed_compares(folders):
+    for seed in range(2):
+        folders.add(seed=seed, score=100.0)
+    for seed in range(3):
+        folders.add(
+            seed=seed, score=0.0, policy={"weight_decay": 0.1}, overrides={"weight_decay": 0.1}
+        )
+    study = Study(tuple(read_runs(folders.made)[0]))
+    cell = study.cell("DQN on classic control", "CartPole-v1", "rigl", 0.9)
+    assert [run.score for run in cell] == [100.0, 100.0]
+    assert "2 variants" in study.remarks[0]
+
+
+# DQN's scores and percentages of the human tester, of the same table of Mnih et al. 2015: an
+# independent check of each pair.
+DQN = {
+    "Assault": (3359, 246.2), "Asterix": (6012, 69.96), "BeamRider": (6846, 119.8),
+    "Boxing": (71.8, 1707.9), "Breakout": (401.2, 1327.2), "CrazyClimber": (114103, 419.5),
+    "DemonAttack": (9711, 294.2), "Enduro": (301.8, 97.47), "FishingDerby": (-0.8, 93.52),
+    "MsPacman": (2311, 13.02), "Pong": (18.9, 132.0), "Qbert": (10596, 78.49),
+    "SpaceInvaders": (1976, 121.5), "Tutankham": (186.7, 112.2), "VideoPinball": (42684, 2539.4),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("env_id", ["ALE/{}-v5", "{}NoFrameskip-v4"])
+def test_the_human_scale_gives_the_published_percentages_of_dqn(folders, env_id):
+    assert set(DQN) == set(HUMAN)
+    for game, (score, _) in DQN.items():
+        folders.add(env_id=env_id.format(game), score=float(score))
+    runs, _ = read_runs(folders.made)
+    normaliser = Normaliser(runs)
+    for run, (game, (_, percentage)) in zip(runs, DQN.items(), strict=True):
+        assert 100 * normaliser(run) == pytest.approx(percentage, rel=1e-3), game
+
+
+def test_mujoco_is_divided_by_the_mean_of_the_same_algorithms_dense_runs(folders):
+    for seed, score in enumerate((900.0, 1100.0)):
+        folders.add("dense", None, seed, score, env_id="Hopper-v5", algo="sac")
+    folders.add("dense", None, 0, 5.0, env_id="Hopper-v5", algo="ppo")
+    folders.add("dense", None, 0, 5.0, match=0.9, env_id="Hopper-v5", algo="sac")
+    folders.add("rigl", 0.9, 0, 1500.0, env_id="Hopper-v5", algo="sac")
+    runs, _ = read_runs(folders.made)
+    normaliser = Normaliser(runs)
+    assert normaliser(runs[-1]) == 1.5
+    assert any("2 dense run(s)" in text for text in normaliser.statements())
+
+
+def test_a_task_without_a_scale_is_named(folders):
+    folders.add("rigl", 0.9, 0, 1500.0, env_id="Hopper-v5", algo="sac")
+    folders.add("dense", None, 0, -5.0, env_id="Reacher-v5", algo="sac")
+    runs, _ = read_runs(folders.made)
+    normaliser = Normaliser(runs)
+    assert normaliser(runs[0]) is None
+    assert "no run of the dense network" in normaliser.missing[0]
+    assert "-5" in normaliser.missing[1]
+
+
+def test_a_damaged_model_is_named_by_the_figure_of_masks(folders):
+    from sb3_sparse.report.figures import NotEnoughData, draw
+
+    folder = folders.add()
+    with zipfile.ZipFile(folder / "CartPole-v1.zip", "w") as file:
+        file.writestr("policy.pth", b"nothing")
+    with pytest.raises(NotEnoughData, match="cannot be read"):
+        draw("masks", Study(tuple(read_runs([folder])[0])))

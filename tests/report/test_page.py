@@ -1,0 +1,156 @@
+from __future__ import annotations
+
+import csv
+import json
+import re
+import shutil
+import subprocess
+
+import pytest
+
+from sb3_sparse.errors import ConfigError
+from sb3_sparse.report import FIGURES, write_report
+from sb3_sparse.report.figures.base import FIGURES as TABLE
+
+BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
+NASTY = '<script>alert(1)</script> & "more"'
+ASK = """
+<script>
+var errors = 0; window.onerror = function () { errors++; };
+window.addEventListener("load", function () {
+  var table = document.querySelectorAll("table")[1], heads = table.querySelectorAll("th");
+  var column = Array.from(heads).findIndex(function (h) {
+    return h.textContent === "mean score"; });
+  function values() { return Array.from(table.tBodies[0].rows).map(function (row) {
+    return parseFloat(row.cells[column].dataset.value); }).filter(function (v) {
+    return !isNaN(v); }); }
+  heads[column].firstChild.click();
+  var up = values(), first = heads[column].getAttribute("aria-sort");
+  heads[column].firstChild.click();
+  var down = values(), second = heads[column].getAttribute("aria-sort");
+  var out = document.createElement("pre"); out.id = "told";
+  out.textContent = JSON.stringify({
+    shown: Array.from(document.images).filter(function (i) { return i.naturalWidth > 0; }).length,
+    images: document.images.length, up: up, down: down, sorts: [first, second], errors: errors,
+    wide: document.documentElement.scrollWidth, window: window.innerWidth });
+  document.body.appendChild(out);
+});
+</script>
+"""
+
+
+@pytest.fixture(scope="module")
+def report(study_folders, tmp_path_factory):
+    out = tmp_path_factory.mktemp("report")
+    return write_report(
+        [*study_folders, out / "nowhere"], out, title=NASTY, figures=list(FIGURES),
+        varies="weight_decay", command=f"continue {NASTY}", pending=[f"cell {NASTY}"],
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("name", list(TABLE))
+def test_each_figure_is_drawn_and_has_its_numbers(report, name):
+    folder = report.parent / "figures"
+    assert (folder / f"{name}.png").read_bytes()[:4] == b"\x89PNG"
+    assert "<svg" in (folder / f"{name}.svg").read_text()[:600]
+    rows = list(csv.reader((folder / f"{name}.csv").open()))
+    assert len(rows) > 1
+    assert {len(row) for row in rows} == {len(rows[0])}
+
+
+def test_the_numbers_behind_figures_are_right(report):
+    rows = list(csv.DictReader((report.parent / "figures" / "flops.csv").open()))
+    share = {
+        row["sparsity"]: float(row["share"]) for row in rows if "Acrobot" in row["environment"]
+    }
+    assert share == pytest.approx({"0.8": 0.2, "0.95": 0.05}, abs=1e-3)
+    rows = list(csv.DictReader((report.parent / "figures" / "ratio.csv").open()))
+    scores = {float(row["actor's share"]): float(row["mean score"]) for row in rows}
+    assert scores == {0.1: 1000.0, 0.34: 1000.0, 0.9: 500.0}
+    rows = list(csv.DictReader((report.parent / "figures" / "sensitivity.csv").open()))
+    found = {
+        row["value"]: float(row["mean score"])
+        for row in rows
+        if (row["environment"], row["method"], row["sparsity"]) == ("CartPole-v1", "rigl", "0.8")
+    }
+    assert {"1e-06", "0.001"} <= set(found)
+    assert (found["1e-06"], found["0.001"]) == (410.0, 400.0)
+    rows = list(csv.DictReader((report.parent / "figures" / "snr.csv").open()))
+    assert {row["network"] for row in rows} == {"q_net"}
+
+
+def test_the_page_says_all_that_it_must(report):
+    text = report.read_text()
+    assert "<script>alert" not in text
+    assert "&lt;script&gt;alert(1)&lt;/script&gt; &amp; &quot;more&quot;" in text
+    for wanted in ("no such folder", "Pending", "Mnih et al. 2015",
+                   "torch 2.13.0", "name=\"viewport\"", "1 only counted"):  # fmt: skip
+        assert wanted in text
+    assert not re.search(r"""(src|href)=["'](https?:)?//""", text)
+    for name in ("cells.csv", "runs.csv", "verdicts.csv"):
+        assert len((report.parent / name).read_text().splitlines()) > 5
+
+
+def test_the_same_runs_give_the_same_bytes(study_folders, tmp_path):
+    few = study_folders[:6]
+    pages = [
+        write_report(few, tmp_path / name, title="t", figures=["parameters", "iqm"])
+        for name in ("a", "b")
+    ]
+    for path in sorted(pages[0].parent.rglob("*.*")):
+        other = pages[1].parent / path.relative_to(pages[0].parent)
+        assert path.read_bytes() == other.read_bytes(), path.name
+
+
+def test_a_figure_without_data_is_left_out_with_a_reason_and_its_old_files_go(folders, tmp_path):
+    folders.add(noise={0.0: 1.0, 1.0: 1.0})
+    out = tmp_path / "out"
+    write_report(folders.made, out, title="t", figures=["noise", "iqm", "snr"])
+    assert (out / "figures" / "noise.svg").is_file()
+    (folders.made[0] / "robustness.csv").unlink()
+    page = write_report(folders.made, out, title="t", figures=["noise", "iqm", "snr"]).read_text()
+    assert not (out / "figures" / "noise.svg").exists()
+    assert "Left out: no run has a robustness.csv" in page
+    assert "fewer than 2 runs" in page
+
+
+def test_a_report_on_nothing_is_a_page_all_the_same(tmp_path):
+    page = write_report([], tmp_path / "out", title="t", figures=list(FIGURES)).read_text()
+    assert page.count("Left out: ") == len(FIGURES)
+
+
+def test_an_unknown_figure_is_refused_before_anything_is_written(tmp_path):
+    with pytest.raises(ConfigError, match="unknown figure 'pie'; allowed are .*iqm"):
+        write_report([], tmp_path / "out", title="t", figures=["pie"])
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.skipif(BROWSER is None, reason="needs chromium or google-chrome")
+@pytest.mark.parametrize("width", [1280, 390])
+def test_the_page_works_in_a_browser(report, tmp_path, width):
+    page = tmp_path / "page.html"
+    page.write_text(report.read_text().replace("<head>", "<head>" + ASK, 1))
+    frame = tmp_path / "frame.html"  # a window is never narrower than 500 pixels; a frame is
+    frame.write_text(
+        f'<iframe id="it" src="page.html" style="width:{width}px;height:900px;border:0"></iframe>'
+        '<script>document.getElementById("it").onload = function () { setTimeout(function () {'
+        "document.body.appendChild(document.importNode("
+        'document.getElementById("it").contentDocument.getElementById("told"), true)); }, 500); };'
+        "</script>"
+    )
+    command = [
+        BROWSER, "--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking",
+        "--allow-file-access-from-files", f"--user-data-dir={tmp_path / 'profile'}",
+        "--virtual-time-budget=10000", "--dump-dom", frame.as_uri(),
+    ]  # fmt: skip
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    found = re.search(r'<pre id="told">(.*?)</pre>', done.stdout)
+    assert found, done.stderr[-2000:]
+    told = json.loads(found.group(1))
+    assert told["shown"] == told["images"] == len(FIGURES)
+    assert told["up"] == sorted(told["up"])
+    assert told["down"] == told["up"][::-1]
+    assert told["sorts"] == ["ascending", "descending"]
+    assert told["errors"] == 0
+    assert told["window"] == width
+    assert told["wide"] <= width

@@ -1,0 +1,155 @@
+"""Each verdict on run folders whose answer is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sb3_sparse.report import FINDINGS, Study, read_runs, verdicts
+
+SUPPORTED, CONTRADICTED, UNDECIDED = "supported", "contradicted", "not enough data"
+
+
+def verdict(folders, key):
+    runs, out = read_runs(folders.made)
+    assert not out
+    found = [one for one in verdicts(Study(tuple(runs))) if one.finding.key == key]
+    assert len(found) == 1
+    return found[0]
+
+
+def seeds(folders, count, score, **given):
+    for seed in range(count):
+        noise = float(np.random.default_rng(seed + 100).normal(0, 2))
+        folders.add(seed=seed, score=score + noise, **given)
+
+
+DENSE, EQUAL = {"method": "dense", "sparsity": None}, {"method": "dense", "sparsity": None}
+EQUAL = {**EQUAL, "match": 0.9}
+
+
+def pair(key, better, worse, folders, count):
+    """Folders in which the first side scores ``better`` and the other ``worse``."""
+    match key:
+        case "equal-parameters":
+            seeds(folders, count, better)
+            seeds(folders, count, worse, **EQUAL)
+        case "no-loss":
+            seeds(folders, count, better)
+            seeds(folders, count, worse, **DENSE)
+        case "rigl-set":
+            seeds(folders, count, better)
+            seeds(folders, count, worse, method="set")
+        case "erk":
+            seeds(folders, count, better)
+            seeds(folders, count, worse, policy={"distribution": "uniform"})
+        case "weight-decay":
+            seeds(folders, count, better, policy={"weight_decay": 1e-6})
+            seeds(folders, count, worse)
+        case "critic":
+            seeds(folders, count, better, share=0.1, policy={"actor_share": 0.1})
+            seeds(folders, count, worse, share=0.9, policy={"actor_share": 0.9})
+        case "snr":
+            for seed in range(count):
+                low, high = better * (1 + 0.01 * seed), worse * (1 + 0.01 * seed)
+                folders.add(seed=seed, snr={"snr/q_net": low, "snr/q_net/active": 1.0})
+                folders.add("dense", None, seed, snr={"snr/q_net": high})
+        case "noise":
+            for seed in range(count):
+                score = 400.0 + seed
+                for side, cost in (({}, better), (EQUAL, worse)):
+                    kept = score - 500 + cost
+                    noise = {0.0: score, 1.0: score - 1, 2.0: kept}
+                    folders.add(seed=seed, score=score, noise=noise, **side)
+
+
+HIGH, LOW = 450.0, 300.0
+GREATER = ["equal-parameters", "no-loss", "erk", "weight-decay", "critic", "noise"]
+
+
+@pytest.mark.parametrize("key", GREATER)
+def test_a_clear_gain_supports_and_a_clear_loss_contradicts(folders, tmp_path, key):
+    pair(key, HIGH, LOW, folders, 4)
+    gain = verdict(folders, key)
+    assert gain.verdict == SUPPORTED
+    assert gain.effect == pytest.approx(150 / 453, abs=0.02)  # CartPole's scale: 22 to 475
+    assert gain.low <= gain.effect + 1e-12
+    assert gain.effect <= gain.high + 1e-12
+    assert gain.seeds == 4
+    worse = type(folders)(tmp_path / "worse")
+    pair(key, LOW, HIGH, worse, 4)
+    assert verdict(worse, key).verdict == CONTRADICTED
+
+
+@pytest.mark.parametrize("key", [*GREATER, "rigl-set", "snr"])
+def test_two_seeds_give_no_verdict(folders, key):
+    pair(key, HIGH, LOW, folders, 2)
+    found = verdict(folders, key)
+    assert found.verdict == UNDECIDED
+    assert found.effect is None
+    assert "3 seeds" in found.remark
+
+
+@pytest.mark.parametrize("finding", FINDINGS, ids=lambda finding: finding.key)
+def test_without_runs_each_finding_says_what_is_missing(folders, finding):
+    folders.add("static", 0.9)
+    found = verdict(folders, finding.key)
+    assert (found.verdict, found.effect) == (UNDECIDED, None)
+    assert found.remark
+
+
+def test_equal_scores_support_that_rigl_is_as_good_as_set(folders):
+    pair("rigl-set", 400.0, 400.0, folders, 5)
+    assert verdict(folders, "rigl-set").verdict == SUPPORTED
+
+
+@pytest.mark.parametrize("scores", [(HIGH, LOW), (LOW, HIGH)])
+def test_a_clear_difference_either_way_contradicts_it(folders, scores):
+    pair("rigl-set", *scores, folders, 5)
+    assert verdict(folders, "rigl-set").verdict == CONTRADICTED
+
+
+def test_a_difference_drowned_in_noise_is_not_decided(folders):
+    for seed, score in enumerate((100.0, 480.0, 250.0)):
+        folders.add("rigl", seed=seed, score=score)
+        folders.add("set", seed=seed, score=580.0 - score)
+    found = verdict(folders, "rigl-set")
+    assert found.verdict == UNDECIDED
+    assert found.effect is not None
+
+
+def test_a_loss_within_the_margin_is_no_loss(folders):
+    pair("no-loss", 396.0, 400.0, folders, 5)
+    found = verdict(folders, "no-loss")
+    assert found.verdict == SUPPORTED
+    assert "margin" in found.remark
+
+
+def test_snr_falls_or_rises_with_sparsity(folders, tmp_path):
+    pair("snr", 0.1, 0.2, folders, 4)
+    falls = verdict(folders, "snr")
+    assert falls.verdict == SUPPORTED
+    assert falls.effect == pytest.approx(np.log(0.5))
+    rises = type(folders)(tmp_path / "rises")
+    pair("snr", 0.2, 0.1, rises, 4)
+    assert verdict(rises, "snr").verdict == CONTRADICTED
+
+
+def test_static_counts_for_no_finding_about_sparse_training(folders):
+    seeds(folders, 4, HIGH, method="static")
+    seeds(folders, 4, LOW, **EQUAL)
+    assert verdict(folders, "equal-parameters").verdict == UNDECIDED
+
+
+def test_a_setting_beside_the_compared_one_must_be_the_same(folders):
+    seeds(folders, 4, HIGH, policy={"weight_decay": 1e-6}, settings={"batch_size": 64})
+    seeds(folders, 4, LOW)
+    assert verdict(folders, "weight-decay").verdict == UNDECIDED
+
+
+def test_tasks_are_strata(folders):
+    for env_id, score in (("CartPole-v1", 400.0), ("Acrobot-v1", -120.0)):
+        seeds(folders, 3, score, env_id=env_id)
+        seeds(folders, 3, score - 60, env_id=env_id, **EQUAL)
+    found = verdict(folders, "equal-parameters")
+    assert (found.verdict, found.strata, found.seeds) == (SUPPORTED, 2, 3)

@@ -1,0 +1,69 @@
+"""``sb3-sparse study`` as a user meets it."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+import yaml
+
+CELLS = {
+    "title": "Two ways to train CartPole",
+    "figures": ["curves", "parameters"],
+    "common": {"algo": "dqn", "env_id": "CartPole-v1"},
+    "runs": [{"method": "dense"}, {"method": "set", "sparsity": 0.5}],
+    "scales": {
+        "smoke": {
+            "n_timesteps": 200,
+            "eval_freq": 100,
+            "eval_episodes": 1,
+            "schedule": {"update_interval": 10},
+            "hyperparams": {"learning_starts": 50, "net_arch": [8], "batch_size": 16},
+        }
+    },
+}
+
+
+def call(*args, cwd):
+    command = [sys.executable, "-c", "from sb3_sparse.cli import main; main()", *args]
+    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=400)
+
+
+def test_a_study_of_ones_own_is_run_looked_at_and_reported(tmp_path):
+    (tmp_path / "mine.yml").write_text(yaml.safe_dump(CELLS))
+    which = ["mine.yml", "--scale", "smoke"]
+    waiting = call("study", "status", *which, cwd=tmp_path)
+    assert "0 done, 0 running, 0 stopped, 0 failed, 2 waiting" in waiting.stdout, waiting.stderr
+
+    done = call("study", "run", *which, "--workers", "2", cwd=tmp_path)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "2 of 2 runs are done" in done.stdout
+    assert "sb3-sparse study report mine.yml --scale smoke" in done.stdout
+    assert len(list((tmp_path / "studies/runs/dqn").iterdir())) == 2
+
+    again = call("study", "run", *which, cwd=tmp_path)
+    assert "2 of 2 runs are done already" in again.stdout
+    assert "left" not in again.stdout  # nothing was run
+
+    report = call("study", "report", *which, cwd=tmp_path)
+    assert report.returncode == 0, report.stderr
+    page = tmp_path / "studies/mine/smoke/index.html"
+    assert f"Written: {page.relative_to(tmp_path)}" in report.stdout
+    assert "Two ways to train CartPole (smoke)" in page.read_text()
+    assert (page.parent / "figures/curves.csv").is_file()
+
+
+@pytest.mark.parametrize(
+    ("args", "said"),
+    [
+        (["run", "figure_1"], "unknown study 'figure_1'; allowed are actor_critic"),
+        (["status", "sac", "--scale", "huge"], "has no scale 'huge', only smoke, small, paper"),
+        (["run", "flops", "--launcher", "slurm"], "unknown launcher 'slurm'"),
+    ],
+)
+def test_mistakes_are_one_line(args, said, tmp_path):
+    done = call("study", *args, cwd=tmp_path)
+    assert done.returncode == 2
+    assert said in done.stderr
+    assert "Traceback" not in done.stderr
