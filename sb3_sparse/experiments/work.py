@@ -58,8 +58,8 @@ def _train(cell: Cell, folder: Path) -> bool:
 def _measure_noise(folder: Path, run: Run, arguments: Mapping[str, Any]) -> None:
     """Return of the last policy under noise, into ``robustness.csv``, whole or not at all."""
     from sb3_sparse.analysis import noise_robustness
+    from sb3_sparse.experiments.noise import noisy_envs
     from sb3_sparse.zoo.environments import is_atari
-    from sb3_sparse.zoo.noise import noisy_envs
 
     model, envs = noisy_envs(folder, run.env_id, run.algo)
     table = noise_robustness(model, envs, **arguments, deterministic=not is_atari(run.env_id))

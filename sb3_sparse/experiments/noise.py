@@ -6,18 +6,16 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.preprocessing import is_image_space
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_sparse.analysis import feature_std
 from sb3_sparse.zoo.experiment import envs_of_run, load_for_prediction, quiet
 from sb3_sparse.zoo.saved import model_in
 
 NOISE_ENVS = 10
-STD_STEPS = 2000
-STD_SEED = 30_000
+SEED = 30_000
 
 
 def noisy_envs(
@@ -35,27 +33,13 @@ def noisy_envs(
 
     def make(wrappers: list[dict[str, Any]]) -> VecEnv:
         with quiet():
-            return envs_of_run(env_id, params, {}, STD_SEED, NOISE_ENVS, wrappers)
+            return envs_of_run(env_id, params, {}, SEED, NOISE_ENVS, wrappers)
 
     if is_image_space(model.observation_space):
         return model, lambda sigma: make([{"sb3_sparse.wrappers.PixelNoise": {"sigma": sigma}}])
     envs = make([])
-    std = _feature_std(model, envs).tolist()
+    std = feature_std(model, envs).tolist()
     envs.close()
     return model, lambda sigma: make(
         [{"sb3_sparse.wrappers.ObservationNoise": {"sigma": sigma, "std": std}}]
     )
-
-
-def _feature_std(model: BaseAlgorithm, envs: VecEnv) -> NDArray[np.float64]:
-    """Standard deviation of each feature while the policy acts, over 2000 steps."""
-    seen: list[NDArray[Any]] = []
-    observation = envs.reset()
-    for _ in range(STD_STEPS // envs.num_envs):
-        raw = envs.get_original_obs() if isinstance(envs, VecNormalize) else observation
-        seen.append(np.array(raw, np.float64))
-        assert not isinstance(observation, (dict, tuple))
-        action, _ = model.predict(observation, deterministic=True)
-        observation, _, _, _ = envs.step(action)
-    std: NDArray[np.float64] = np.concatenate(seen).std(axis=0)
-    return std
