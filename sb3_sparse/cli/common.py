@@ -51,6 +51,8 @@ Statistics = Annotated[
     Path | None,
     text("Statistics saved by VecNormalize.", "--vecnormalize", shown="those of the run"),
 ]
+Launcher = Annotated[str, text("local: processes of this machine; ray: a Ray cluster.")]
+Address = Annotated[str | None, text("Of the Ray cluster, e.g. auto.", shown="one of this machine")]
 Device = Annotated[str, text("auto, cpu or cuda.")]
 LogFolder = Annotated[Path, text("Where folders are made.", "--log-folder", "-f")]
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.table import Table
 
-from sb3_sparse.cli.common import INTERRUPTED, console, text
+from sb3_sparse.cli.common import INTERRUPTED, Address, Launcher, console, text
 from sb3_sparse.cli.studyprogress import StudyProgress
 
 if TYPE_CHECKING:
@@ -44,12 +44,8 @@ def run(
     name: Name,
     scale: Scale = "small",
     workers: Annotated[int, text("Runs at once, each a process of one thread.")] = 1,
-    launcher: Annotated[
-        str, text("local: processes of this machine; ray: a Ray cluster.")
-    ] = "local",
-    address: Annotated[
-        str | None, text("Of the Ray cluster, e.g. auto.", shown="one of this machine")
-    ] = None,
+    launcher: Launcher = "local",
+    address: Address = None,
     store: Store = Path("studies"),
 ) -> None:
     """Train what a study lacks. What is done stays done; the same command goes on."""

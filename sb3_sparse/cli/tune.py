@@ -11,6 +11,7 @@ from typer.core import TyperGroup
 
 from sb3_sparse.cli.common import (
     INTERRUPTED,
+    Address,
     Algo,
     ConfFile,
     Device,
@@ -20,6 +21,7 @@ from sb3_sparse.cli.common import (
     EvalEpisodes,
     EvalFreq,
     Hyperparams,
+    Launcher,
     LogFolder,
     Method,
     Sparsity,
@@ -80,12 +82,8 @@ def search(
         text("none, median, halving or hyperband.", shown="none for a grid, else median"),
     ] = None,
     workers: Annotated[int, text("Trials at once, each a process of one thread.")] = 1,
-    launcher: Annotated[
-        str, text("local: processes of this machine; ray: a Ray cluster.")
-    ] = "local",
-    address: Annotated[
-        str | None, text("Of the Ray cluster, e.g. auto.", shown="one of this machine")
-    ] = None,
+    launcher: Launcher = "local",
+    address: Address = None,
     storage: Storage = None,
     study_name: Annotated[
         str | None, text("Name of the study.", shown="made of algorithm, env, method, space")
