@@ -6,6 +6,7 @@ import ast
 import inspect
 from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
+from functools import cache
 from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -105,7 +106,8 @@ def _listed(names: Iterable[str]) -> str:
     return ", ".join(sorted(names))
 
 
-def _arguments(cls: type) -> set[str]:
+@cache
+def _arguments(cls: type) -> frozenset[str]:
     """Names that a class and its bases take when made, but those that every SB3 class is given."""
     names: set[str] = set()
     for base in cls.__mro__:
@@ -114,7 +116,7 @@ def _arguments(cls: type) -> set[str]:
     given = (
         "self args kwargs env observation_space action_space lr_schedule supported_action_spaces"
     )
-    return names - set(given.split()) - {"_init_setup_model", "support_multi_env"}
+    return frozenset(names - {*given.split(), "_init_setup_model", "support_multi_env"})
 
 
 def sparsity_callback(settings: Mapping[str, Any], wanted: str = "") -> dict[str, Any]:
