@@ -65,7 +65,7 @@ def compress(
         write_run_files,
     )
     from sb3_sparse.zoo.saved import find_saved
-    from sb3_sparse.zoo.speed import compute_fast
+    from sb3_sparse.zoo.speed import use_few_threads
 
     saved = find_saved(model, best=best, algo=algo, env_id=env, vecnormalize=vecnormalize)
     env_id = environment_of(saved)
@@ -75,7 +75,7 @@ def compress(
     try:
         trained = saved.load(training)
         trained.verbose, trained.tensorboard_log = 0, None
-        compute_fast(trained.observation_space)
+        use_few_threads(trained.observation_space)
         _say(f"Compressing {saved.path} ({saved.algo.upper()} on {env_id}) into {folder}")
         folder.mkdir(parents=True, exist_ok=True)
         with locked(folder):

@@ -11,7 +11,7 @@ from sb3_sparse.errors import ConfigError
 from sb3_sparse.policies.mixin import SparsePolicyMixin
 from sb3_sparse.policies.report import SparsityReport
 from sb3_sparse.zoo.saved import arguments_of, is_run, model_in, read_zip, zip_path
-from sb3_sparse.zoo.speed import compute_fast
+from sb3_sparse.zoo.speed import use_few_threads
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ def inspect_model(path: Path) -> Inspection:
     """The sparsity report of a saved model, and how its layers would best be computed here."""
     policy, data = _load(path)
     batch = data.get("batch_size") or data["n_steps"] * data["n_envs"]  # A2C: the whole rollout
-    compute_fast(policy.observation_space)
+    use_few_threads(policy.observation_space)
     return Inspection(
         report=policy.sparsity_report(),
         choice=choose(policy, list(policy.sparse.layers), batch),

@@ -27,7 +27,7 @@ from sb3_sparse.zoo.prepare import doubt, explained, prepare
 from sb3_sparse.zoo.record import read_record, sparsity_of, write_record
 from sb3_sparse.zoo.results import Outcome, final_results
 from sb3_sparse.zoo.run import Run
-from sb3_sparse.zoo.speed import compute_fast
+from sb3_sparse.zoo.speed import denormals_as_zero, use_few_threads
 
 EVALUATION_ENVS = 10
 
@@ -57,7 +57,7 @@ def train(
         tensorboard_log = str(Path(tensorboard_log).absolute())  # also after a resume elsewhere
     prepared = prepare(run, log_folder)
     settings, evaluation = prepared.settings, prepared.evaluation
-    compute_fast(prepared.observation_space)
+    use_few_threads(prepared.observation_space)
     if folder is None:
         folder = new_run_folder(log_folder / run.algo, run.env_id.replace("/", "-"))
     else:
@@ -103,7 +103,7 @@ def resume(folder: Path, callbacks: Sequence[BaseCallback] = ()) -> Outcome:
         start = folder if record.get("trained") else last_checkpoint(folder)
         with explained(f"the run in {folder} cannot go on from {start or 'its start'}", run.env_id):
             observation_space, _ = spaces_of(run, settings, folder, evaluation)
-            compute_fast(observation_space)
+            use_few_threads(observation_space)
             if start != folder:
                 restore_monitors(folder, start)
             experiment = Experiment(
@@ -158,7 +158,7 @@ def _learn(
         if done < planned:
             status = "evaluating"
             try:
-                with checkpoints.on_signals():
+                with checkpoints.on_signals(), denormals_as_zero():
                     model.learn(
                         planned - done,
                         callback=[*experiment.callbacks, evaluation, checkpoints, *callbacks],
