@@ -14,7 +14,6 @@ from sb3_sparse.report.figures.snr import FILE as SNR_FILE
 from sb3_sparse.report.figures.snr import of_networks
 from sb3_sparse.report.measured import returns_by_sigma, series
 from sb3_sparse.report.methods import DENSE, EQUAL, percent
-from sb3_sparse.report.settings import variant_of
 from sb3_sparse.report.study import Study
 
 DYNAMIC = ("prune", "set", "rigl")
@@ -179,7 +178,7 @@ def _at_level(run: RunData) -> str:
 
 def _all_but(name: str) -> Callable[[RunData], str]:
     def stratum(run: RunData) -> str:
-        return f"{_at_level(run)}, {run.label}|{variant_of(run.settings, (name,))}"
+        return f"{_at_level(run)}, {run.label}|{run.variant(name)}"
 
     return stratum
 
@@ -217,6 +216,6 @@ def _by_seed(pairs: list[Valued]) -> list[float]:
     """Mean over methods and settings of each seed that all of them have."""
     kinds: dict[tuple[str, float, str], dict[int, float]] = defaultdict(dict)
     for run, value in pairs:
-        kinds[run.label, run.level, variant_of(run.settings)][run.seed] = value
+        kinds[run.label, run.level, run.variant()][run.seed] = value
     seeds = set.intersection(*(set(kind) for kind in kinds.values()))
     return [fmean(kind[seed] for kind in kinds.values()) for seed in sorted(seeds)]

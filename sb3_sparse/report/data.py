@@ -17,7 +17,7 @@ import numpy.typing as npt
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.report.measured import Rows, read_rows
 from sb3_sparse.report.methods import DENSE, EQUAL
-from sb3_sparse.report.settings import callback_of, family_of
+from sb3_sparse.report.settings import WIDTHS, callback_of, family_of, variant_of
 from sb3_sparse.zoo.record import NAME, read_record
 from sb3_sparse.zoo.results import score_of
 
@@ -122,6 +122,11 @@ class RunData:
         return int(self.record["total"]["parameters"])
 
     @property
+    def connections(self) -> int:
+        """Active weights."""
+        return sum(int(layer["nnz"]) for layer in self.layers)
+
+    @property
     def flops(self) -> int:
         """Of one forward pass of all networks, for one observation."""
         return int(self.record["total"]["flops"])
@@ -143,6 +148,13 @@ class RunData:
             counts[layer["network"]] = counts.get(layer["network"], 0) + int(layer["nnz"])
         total = sum(counts.values())
         return counts["actor"] / total if len(counts) > 1 and counts.get("actor") else None
+
+    def variant(self, *without: str) -> str:
+        """Its settings but for method and sparsity, as one comparable text.
+
+        :param without: names of more settings that may differ
+        """
+        return variant_of(self.settings, (*without, *(WIDTHS if self.label == EQUAL else ())))
 
     @property
     def callback(self) -> Mapping[str, Any]:

@@ -23,8 +23,9 @@ MUJOCO = (
     "InvertedDoublePendulum",
 ) + ("InvertedPendulum", "Pusher", "Reacher", "Swimmer", "Walker2d")
 ATARI, CONTROL, PHYSICS, OTHER = "Atari", "classic control", "MuJoCo", "other tasks"
-# The size of a network follows from the method and sparsity, which are compared.
-FOLLOWING = ("sparsity", "initial_sparsity", "net_arch", "features_extractor_kwargs", "method")
+# What is compared anyway. Widths follow from it in a dense network that matches a sparse one.
+COMPARED = ("sparsity", "initial_sparsity", "method")
+WIDTHS = ("net_arch", "features_extractor_class", "features_extractor_kwargs")
 
 
 def game_of(env_id: str) -> str:
@@ -82,11 +83,11 @@ def setting_of(algo: str, settings: Mapping[str, Any], name: str) -> Any:
 
 
 def variant_of(settings: Mapping[str, Any], without: Iterable[str] = ()) -> str:
-    """All settings but those that follow from method and sparsity, as one comparable text.
+    """All settings but method and sparsity, as one comparable text.
 
     :param without: names of more settings that may differ
     """
-    hidden = {*FOLLOWING, *without}
+    hidden = {*COMPARED, *without}
 
     def kept(values: Mapping[str, Any]) -> dict[str, Any]:
         return {name: value for name, value in values.items() if name not in hidden}

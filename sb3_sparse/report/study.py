@@ -10,7 +10,7 @@ from functools import cached_property
 from sb3_sparse.report.data import RunData
 from sb3_sparse.report.methods import DENSE, in_order
 from sb3_sparse.report.normalisation import Normaliser
-from sb3_sparse.report.settings import overrides_of, setting_of, variant_of
+from sb3_sparse.report.settings import overrides_of, setting_of
 
 Cell = tuple[str, str, str, float]
 
@@ -112,7 +112,7 @@ def choose(runs: Sequence[RunData]) -> tuple[list[RunData], list[str]]:
     for cell, members in sorted(grouped(runs, cell_of).items()):
         variants: dict[str, list[RunData]] = defaultdict(list)
         for run in members:
-            variants[variant_of(run.settings)].append(run)
+            variants[run.variant()].append(run)
         chosen = min(
             variants, key=lambda text: (_changed(variants[text]), -len(variants[text]), text)
         )

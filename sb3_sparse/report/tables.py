@@ -13,7 +13,6 @@ import numpy as np
 
 from sb3_sparse.report.data import RunData
 from sb3_sparse.report.methods import DENSE, EQUAL, name_of
-from sb3_sparse.report.settings import variant_of
 from sb3_sparse.report.statistics import LEAST, iqm, iqm_estimates
 from sb3_sparse.report.study import Study, cell_of, grouped
 from sb3_sparse.report.verdicts import Verdict
@@ -38,7 +37,7 @@ def cells_table(study: Study) -> Table:
     for _, members in sorted(grouped(study.runs, cell_of).items()):
         variants: dict[str, list[RunData]] = {}
         for run in members:
-            variants.setdefault(f"{run.trained}{variant_of(run.settings)}", []).append(run)
+            variants.setdefault(f"{run.trained}{run.variant()}", []).append(run)
         for number, runs in enumerate(variants.values(), start=1):
             rows.append(_cell(study, runs, f"{number} of {len(variants)}", id(runs[0]) in main))
     return Table([*heads, "parameters", "FLOPs", "FLOPs of dense"], rows)

@@ -40,6 +40,7 @@ class Folders:
         evaluations: int = 10,
         model: bool = False,
         share: float | None = None,
+        size: float = 1.0,
         snr: dict[str, float] | None = None,
         noise: dict[float, float] | None = None,
     ) -> Path:
@@ -48,7 +49,7 @@ class Folders:
         folder.mkdir(parents=True)
         self.made.append(folder)
         removed = 0.0 if method == "dense" else float(sparsity or 0)
-        shrunk = 1 - (match or 0.0)
+        shrunk = (1 - (match or 0.0)) * size
         kwargs: dict[str, Any] = {"net_arch": [round(HIDDEN * shrunk) or 1], **(policy or {})}
         entry: dict[str, Any] = {
             "n_timesteps": 1000,

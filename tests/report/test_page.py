@@ -154,3 +154,25 @@ def test_the_page_works_in_a_browser(report, tmp_path, width):
     assert told["errors"] == 0
     assert told["window"] == width
     assert told["wide"] <= width
+
+
+def test_dense_networks_of_other_budgets_are_never_averaged(folders, tmp_path):
+    """Two budgets, each with an actor of a tenth and of a third of the connections."""
+    for seed in range(3):
+        for total, score in ((1.0, 1000.0), (0.2, 300.0)):
+            for share in (0.1, 0.34):
+                arch = {"pi": [int(100 * share)], "qf": [int(1000 * total)]}
+                folders.add(
+                    "dense", None, seed, score + 100 * share, env_id="Hopper-v5", algo="sac",
+                    share=share, size=total, policy={"net_arch": arch},
+                    overrides={"net_arch": arch},
+                )  # fmt: skip
+    write_report(folders.made, tmp_path / "out", title="T", figures=["ratio"])
+    rows = list(csv.DictReader((tmp_path / "out/figures/ratio.csv").open()))
+    found = {
+        (float(row["budget"]), float(row["actor's share"])): float(row["mean score"])
+        for row in rows
+    }
+    assert found == {(1.0, 0.1): 1010.0, (1.0, 0.34): 1034.0, (0.2, 0.1): 310.0, (0.2, 0.34): 334.0}
+    cells = list(csv.DictReader((tmp_path / "out/cells.csv").open()))
+    assert [row["seeds"] for row in cells] == ["3"] * 4

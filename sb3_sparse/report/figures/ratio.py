@@ -10,7 +10,6 @@ import numpy as np
 from sb3_sparse.report.data import RunData
 from sb3_sparse.report.figures.base import Drawing, NotEnoughData, figure, legend, line, panels
 from sb3_sparse.report.methods import DENSE, name_of, percent, shaded
-from sb3_sparse.report.settings import variant_of
 from sb3_sparse.report.statistics import mean
 from sb3_sparse.report.study import Study
 
@@ -39,7 +38,7 @@ def draw(study: Study) -> Drawing:
     found: dict[tuple[str, str], dict[Line, dict[float, list[RunData]]]] = {}
     for run in study.trained:
         if run.actor_share is not None:
-            kind = (run.label, run.level, variant_of(run.settings, ("actor_share",)))
+            kind = (run.label, _budget(study, run), run.variant("actor_share", "net_arch"))
             shares = found.setdefault((run.family, run.env_id), {}).setdefault(kind, {})
             shares.setdefault(round(run.actor_share, 2), []).append(run)
     places = {
@@ -55,17 +54,16 @@ def draw(study: Study) -> Drawing:
     made, axes = panels(len(places), columns=3, height=3.0)
     rows: list[list[Any]] = []
     for one, ((family, env_id), lines) in zip(axes, sorted(places.items()), strict=True):
-        budgets = sorted({level for _, level, _ in lines})
-        for (label, level, _), shares in sorted(lines.items()):
+        budgets = sorted({budget for _, budget, _ in lines}, reverse=True)
+        for (label, budget, _), shares in sorted(lines.items()):
             estimates = {x: mean([run.score for run in runs]) for x, runs in sorted(shares.items())}
-            budget = 1 - level
             for x, e in estimates.items():
                 rows.append([family, env_id, label, budget, x, e.value, e.low, e.high, e.seeds])
             ends = [
                 np.array([getattr(e, end) for e in estimates.values()])
                 for end in ("value", "low", "high")
             ]
-            look = shaded(label, budgets.index(level))
+            look = shaded(label, budgets.index(budget))
             text = f"{name_of(label)}, {percent(budget)} of parameters"
             line(one, [100 * x for x in estimates], (ends[0], ends[1], ends[2]), look, text)
         usual = _usual(study, family, env_id)
@@ -82,11 +80,23 @@ def draw(study: Study) -> Drawing:
     return Drawing(made, HEADS, rows)
 
 
+def _budget(study: Study, run: RunData) -> float:
+    """Share of the connections of the largest dense network; of dense ones to one digit."""
+    if run.label != DENSE:
+        return round(1 - run.level, 6)
+    dense = [
+        other.connections
+        for other in study.trained
+        if (other.family, other.env_id, other.label) == (run.family, run.env_id, DENSE)
+    ]
+    return float(f"{run.connections / max(dense):.1g}")
+
+
 def _usual(study: Study, family: str, env_id: str) -> float | None:
     """The split that nobody asked for: that of the runs without an ``actor_share``."""
     shares: dict[str, list[float]] = defaultdict(list)
     for run in study.trained:
         if (run.family, run.env_id) == (family, env_id) and run.actor_share is not None:
-            asked = study.setting(run, "actor_share")
-            shares["usual" if asked is None else "asked"].append(run.actor_share)
+            asked = study.setting(run, "actor_share") or run.record["run"].get("hyperparams")
+            shares["asked" if asked else "usual"].append(run.actor_share)
     return sorted(shares["usual"])[len(shares["usual"]) // 2] if shares["usual"] else None

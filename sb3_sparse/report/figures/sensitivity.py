@@ -9,7 +9,6 @@ import numpy as np
 from sb3_sparse.report.data import RunData
 from sb3_sparse.report.figures.base import Drawing, NotEnoughData, figure, legend, line, panels
 from sb3_sparse.report.methods import DENSE, in_order, look_of, name_of, percent
-from sb3_sparse.report.settings import variant_of
 from sb3_sparse.report.statistics import mean
 from sb3_sparse.report.study import Study
 
@@ -33,7 +32,7 @@ def draw(study: Study) -> Drawing:
         raise NotEnoughData("it needs the name of the setting that was varied (varies)")
     found: dict[Place, dict[tuple[str, str], dict[Any, list[RunData]]]] = {}
     for run in study.trained:
-        kind = (run.label, variant_of(run.settings, (name,)))
+        kind = (run.label, run.variant(name))
         values = found.setdefault((run.family, run.env_id, run.level), {}).setdefault(kind, {})
         values.setdefault(_key(study.setting(run, name)), []).append(run)
     places = {
