@@ -54,6 +54,14 @@ def test_a_study_of_ones_own_is_run_looked_at_and_reported(tmp_path):
     assert (page.parent / "figures/curves.csv").is_file()
 
 
+def test_an_unknown_figure_is_known_before_anything_is_run(tmp_path):
+    (tmp_path / "mine.yml").write_text(yaml.safe_dump({**CELLS, "figures": ["curve"]}))
+    done = call("study", "run", "mine.yml", "--scale", "smoke", cwd=tmp_path)
+    assert done.returncode == 2
+    assert "unknown figure 'curve'; allowed are iqm" in done.stderr.replace("\n", " ")
+    assert not (tmp_path / "studies").exists()
+
+
 @pytest.mark.parametrize(
     ("args", "said"),
     [

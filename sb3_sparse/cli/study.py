@@ -12,6 +12,7 @@ from rich.table import Table
 
 from sb3_sparse.cli.common import INTERRUPTED, Address, Launcher, console, text
 from sb3_sparse.cli.studyprogress import StudyProgress
+from sb3_sparse.errors import MissingExtra
 
 if TYPE_CHECKING:
     from sb3_sparse.experiments import Study
@@ -53,6 +54,8 @@ def run(
     from sb3_sparse.launch import launcher_named
 
     study = Study.read(name, scale)
+    if Path(name).suffix:
+        _check_figures(study)
     runner = run_study(study, store, launcher_named(launcher, address), workers)
     shown = StudyProgress(console)
     last = None
@@ -126,6 +129,15 @@ def report(
         pending=[one.cell.name for one in standings if one.status != "done"],
     )
     console.print(f"Written: {page}", soft_wrap=True)
+
+
+def _check_figures(study: Study) -> None:
+    """An unknown figure is better known before the runs; without the extra it is told after."""
+    try:
+        from sb3_sparse.report.figures import check_figures
+    except MissingExtra:
+        return
+    check_figures(study.figures)
 
 
 def _standings(study: Study, store: Path) -> list[CellStanding]:

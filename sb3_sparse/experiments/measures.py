@@ -43,6 +43,8 @@ class Measures:
                 raise ConfigError(
                     f"measure {name} takes {', '.join(allowed[name])}, got {arguments!r}"
                 )
+            for key, value in arguments.items():
+                _check(f"{key} of measure {name}", value, key == "sigmas")
         return cls(
             {name: dict(given[name]) for name in DURING if name in given},
             {name: dict(given[name]) for name in AFTER if name in given},
@@ -67,3 +69,13 @@ class Measures:
         """
         measured = record.get("measured", {})
         return {name: given for name, given in self.after.items() if measured.get(name) != given}
+
+
+def _check(what: str, value: Any, several: bool) -> None:
+    """Refuse what would fail after training only."""
+    if several:
+        numbers = value if isinstance(value, list) else []
+        if not numbers or not all(type(one) in (int, float) and one >= 0 for one in numbers):
+            raise ConfigError(f"{what} must be a list of numbers, 0 or more, got {value!r}")
+    elif type(value) is not int or value < 1:
+        raise ConfigError(f"{what} must be a whole number, 1 or more, got {value!r}")

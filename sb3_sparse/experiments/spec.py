@@ -68,16 +68,24 @@ class Study:
         for key in ("title", "figures", "runs", "scales"):
             if key not in content:
                 raise ConfigError(f"{path} lacks {key!r} (docs/studies.md)")
+        figures = content["figures"]
+        if not isinstance(figures, list) or not all(isinstance(one, str) for one in figures):
+            raise ConfigError(f"{path}: figures must be a list of names, got {figures!r}")
         scales = content["scales"]
         if not isinstance(scales, Mapping) or scale not in scales:
             known = ", ".join(scales) if isinstance(scales, Mapping) else repr(scales)
             raise ConfigError(f"{path} has no scale {scale!r}, only {known}")
         try:
-            cells = tuple(_cells(content, dict(scales[scale] or {})))
+            cells = tuple(_cells(content, scales[scale] or {}))
         except ConfigError as error:
             raise ConfigError(f"{path}, scale {scale}: {error}") from error
-        varies = content.get("varies")
-        return cls(path.stem, scale, content["title"], tuple(content["figures"]), varies, cells)
+        if not cells:
+            raise ConfigError(
+                f"{path} has no run at scale {scale}: its blocks and the scale have no method or "
+                "sparsity in common, or runs is empty (docs/studies.md)"
+            )
+        title, varies = str(content["title"]), content.get("varies")
+        return cls(path.stem, scale, title, tuple(figures), varies, cells)
 
     @property
     def report_folder(self) -> Path:
@@ -100,15 +108,22 @@ def check_keys(given: Any, allowed: set[str], where: str) -> None:
         )
 
 
-def _cells(content: Mapping[str, Any], scale: dict[str, Any]) -> Iterator[Cell]:
+def _cells(content: Mapping[str, Any], of_scale: Any) -> Iterator[Cell]:
     """All cells of a scale, first seeds first, none twice."""
-    check_keys(scale, RUN_KEYS | {SEEDS, MEASURES, SCHEDULE, VARY}, "a scale")
+    check_keys(of_scale, RUN_KEYS | {SEEDS, MEASURES, SCHEDULE, VARY}, "a scale")
+    if not isinstance(content["runs"], list):
+        raise ConfigError(f"runs must be a list of blocks, got {content['runs']!r}")
+    scale = dict(of_scale)
     seeds = scale.pop(SEEDS, 1)
     if isinstance(seeds, bool) or not isinstance(seeds, int) or seeds < 1:
         raise ConfigError(f"seeds must be a number, 1 or more, got {seeds!r}")
     measures = Measures.of(scale.pop(MEASURES, content.get(MEASURES, {})))
     schedule = scale.pop(SCHEDULE, {})
-    trained = bool(content.get("trained", True))
+    if not isinstance(schedule, Mapping):
+        raise ConfigError(f"schedule must be a mapping, got {schedule!r}")
+    trained = content.get("trained", True)
+    if not isinstance(trained, bool):
+        raise ConfigError(f"trained must be true or false, got {trained!r}")
     runs = [
         arguments
         for block in content["runs"]

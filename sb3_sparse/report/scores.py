@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from sb3_sparse.report.data import Array
 from sb3_sparse.report.methods import DENSE, in_order, name_of, percent
 from sb3_sparse.report.statistics import LEAST, rectangle
-from sb3_sparse.report.study import Study
+from sb3_sparse.report.study import NotEnoughData, Study
 
 
 def panel(study: Study, family: str, level: float) -> tuple[dict[str, Array], list[str], list[str]]:
@@ -48,7 +48,10 @@ def panel(study: Study, family: str, level: float) -> tuple[dict[str, Array], li
 def panels_of(
     study: Study,
 ) -> tuple[list[tuple[str, float, dict[str, Array], list[str]]], list[str]]:
-    """All panels ``(family, level, scores, tasks)`` with enough runs, and what was left out."""
+    """All panels ``(family, level, scores, tasks)`` with enough runs, and what was left out.
+
+    :raises NotEnoughData: if there is none
+    """
     found, remarks = [], []
     for family in study.families():
         for level in study.levels(family):
@@ -56,11 +59,12 @@ def panels_of(
             remarks += said
             if scores:
                 found.append((family, level, scores, tasks))
+    if not found:
+        raise NotEnoughData(_why_not(study, remarks))
     return found, remarks
 
 
-def why_not(study: Study, remarks: Sequence[str]) -> str:
-    """Why there is no panel at all."""
+def _why_not(study: Study, remarks: Sequence[str]) -> str:
     reasons = [*study.normaliser.missing, *dict.fromkeys(remarks)]
     first = "; ".join(reasons[:4]) + ("; and so on" if len(reasons) > 4 else "")
     return f"no sparsity has two runs or more of a method with normalised scores. {first}".strip()

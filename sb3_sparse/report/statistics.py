@@ -180,6 +180,18 @@ def means(values: Array) -> tuple[Array, Array, Array]:
     return middle, middle - half, middle + half
 
 
+def means_at(
+    seeds: Sequence[Mapping[float, float]],
+) -> tuple[list[float], tuple[Array, Array, Array]]:
+    """The same of curves, at the points that all of them have.
+
+    :param seeds: value by point, a curve a seed
+    :return: the points in order, and what :func:`means` gives there
+    """
+    points = sorted(set.intersection(*(set(curve) for curve in seeds)))
+    return points, means(np.array([[curve[x] for x in points] for curve in seeds]))
+
+
 def _shares(scores: Array, taus: Array) -> Array:
     shares: Array = (scores.reshape(-1, 1) > taus).mean(axis=0)
     return shares

@@ -7,12 +7,17 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
+from sb3_sparse.errors import SparsityError
 from sb3_sparse.report.data import RunData
 from sb3_sparse.report.methods import DENSE, in_order
 from sb3_sparse.report.normalisation import Normaliser
 from sb3_sparse.report.settings import overrides_of, setting_of
 
 Cell = tuple[str, str, str, float]
+
+
+class NotEnoughData(SparsityError):
+    """A figure cannot be drawn from these runs; the message says why."""
 
 
 @dataclass(frozen=True)

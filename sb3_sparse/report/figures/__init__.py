@@ -16,10 +16,10 @@ from sb3_sparse.report.figures import (  # noqa: F401
 from sb3_sparse.report.figures.base import (
     FIGURES,
     Drawing,
-    NotEnoughData,
     check_figures,
     draw,
     save,
 )
+from sb3_sparse.report.study import NotEnoughData
 
 __all__ = ["FIGURES", "Drawing", "NotEnoughData", "check_figures", "draw", "save"]

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from sb3_sparse.report.figures.base import Drawing, NotEnoughData, figure, panels
+from sb3_sparse.report.figures.base import Drawing, figure, panels
 from sb3_sparse.report.methods import look_of, name_of, percent
-from sb3_sparse.report.scores import panels_of, why_not
+from sb3_sparse.report.scores import panels_of
 from sb3_sparse.report.statistics import iqm_estimates
 from sb3_sparse.report.study import Study
 
@@ -22,8 +22,6 @@ HEADS = ("family", "sparsity", "method", "iqm", "low", "high", "seeds", "tasks")
 def draw(study: Study) -> Drawing:
     """A panel a sparsity, an interval a method."""
     found, remarks = panels_of(study)
-    if not found:
-        raise NotEnoughData(why_not(study, remarks))
     made, axes = panels(len(found))
     rows: list[list[Any]] = []
     for one, (family, level, scores, tasks) in zip(axes, found, strict=True):

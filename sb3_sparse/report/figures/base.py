@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from sb3_sparse.errors import ConfigError, SparsityError
+from sb3_sparse.errors import ConfigError
 from sb3_sparse.report.backend import (
     Axes,
     EngFormatter,
@@ -21,6 +21,7 @@ from sb3_sparse.report.backend import (
 )
 from sb3_sparse.report.data import Array
 from sb3_sparse.report.methods import Look
+from sb3_sparse.report.statistics import Estimate
 from sb3_sparse.report.study import Study
 
 WIDTH, HEIGHT, COLUMNS = 3.4, 2.7, 3
@@ -41,10 +42,6 @@ STYLE: Any = {
     "svg.fonttype": "path",
     "font.family": "DejaVu Sans",
 }
-
-
-class NotEnoughData(SparsityError):
-    """A figure cannot be drawn from these runs; the message says why."""
 
 
 @dataclass(frozen=True)
@@ -130,6 +127,17 @@ def line(
     )  # fmt: skip
     if not np.isnan(low).all():
         axes.fill_between(x, low, high, color=look.color, alpha=0.15, linewidth=0)
+
+
+def estimates_line(
+    axes: Axes, x: Sequence[float], estimates: Sequence[Estimate], look: Look, label: str
+) -> None:
+    """The same of estimates."""
+    middle, low, high = (
+        np.array([getattr(estimate, end) for estimate in estimates])
+        for end in ("value", "low", "high")
+    )
+    line(axes, x, (middle, low, high), look, label)
 
 
 def logarithmic(one: Axes, which: str) -> None:

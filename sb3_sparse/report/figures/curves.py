@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from sb3_sparse.report.data import Array, RunData
-from sb3_sparse.report.figures.base import Drawing, NotEnoughData, figure, legend, line, panels
+from sb3_sparse.report.figures.base import Drawing, figure, legend, line, panels
 from sb3_sparse.report.methods import DENSE, look_of, name_of, percent
 from sb3_sparse.report.statistics import means
-from sb3_sparse.report.study import Study
+from sb3_sparse.report.study import NotEnoughData, Study
 
 HEADS = ("family", "environment", "sparsity", "method", "timesteps", "mean", "low", "high", "seeds")
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 from sb3_sparse.report.backend import PercentFormatter
-from sb3_sparse.report.figures.base import Drawing, NotEnoughData, figure, legend, panels
+from sb3_sparse.report.figures.base import Drawing, figure, legend, panels
 from sb3_sparse.report.methods import DENSE, EQUAL
-from sb3_sparse.report.study import Study
+from sb3_sparse.report.study import NotEnoughData, Study
 
 HEADS = ("family", "environment", "distribution", "sparsity", "flops", "dense flops", "share")
 DRAWN = {

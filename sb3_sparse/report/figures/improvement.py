@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from sb3_sparse.report.figures.base import Drawing, NotEnoughData, figure, panels
+from sb3_sparse.report.figures.base import Drawing, figure, panels
 from sb3_sparse.report.methods import DENSE, EQUAL, look_of, name_of, percent
-from sb3_sparse.report.scores import panels_of, why_not
+from sb3_sparse.report.scores import panels_of
 from sb3_sparse.report.statistics import improvement
-from sb3_sparse.report.study import Study
+from sb3_sparse.report.study import NotEnoughData, Study
 
 HEADS = ("family", "sparsity", "method", "against", "probability", "low", "high", "seeds", "tasks")
 SHORT = {DENSE: "dense 100 %", EQUAL: "equal dense"}
@@ -26,9 +26,7 @@ def draw(study: Study) -> Drawing:
     found, remarks = panels_of(study)
     paired = [(*one, pairs) for one in found if (pairs := _pairs(list(one[2])))]
     if not paired:
-        raise NotEnoughData(
-            "no sparsity has two methods to compare" if found else why_not(study, remarks)
-        )
+        raise NotEnoughData("no sparsity has two methods to compare")
     most = max(len(pairs) for *_, pairs in paired)
     made, axes = panels(len(paired), height=1.2 + 0.26 * most)
     rows: list[list[Any]] = []

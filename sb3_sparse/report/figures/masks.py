@@ -13,9 +13,9 @@ import torch as th
 
 from sb3_sparse.report.backend import MaxNLocator
 from sb3_sparse.report.data import Array, RunData
-from sb3_sparse.report.figures.base import Drawing, NotEnoughData, figure, panels
+from sb3_sparse.report.figures.base import Drawing, figure, panels
 from sb3_sparse.report.methods import name_of, percent
-from sb3_sparse.report.study import Study
+from sb3_sparse.report.study import NotEnoughData, Study
 
 HEADS = ("run", "method", "sparsity", "layer", "shape", "block row", "densities of the blocks")
 BLOCKS, LAYERS, CLOSE_TO = 128, 4, 0.9

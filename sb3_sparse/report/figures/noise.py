@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections import defaultdict
 from typing import Any
 
-import numpy as np
-
-from sb3_sparse.report.figures.base import Drawing, NotEnoughData, figure, legend, line, panels
+from sb3_sparse.report.figures.base import Drawing, figure, legend, line, panels
 from sb3_sparse.report.measured import returns_by_sigma
 from sb3_sparse.report.methods import DENSE, name_of, percent, shaded
-from sb3_sparse.report.statistics import means
-from sb3_sparse.report.study import Study
+from sb3_sparse.report.statistics import means_at
+from sb3_sparse.report.study import NotEnoughData, Study
 
 HEADS = ("family", "environment", "method", "parameters kept", "sigma", "return", "low", "high") + (
     "seeds",
@@ -41,10 +39,9 @@ def draw(study: Study) -> Drawing:
     rows: list[list[Any]] = []
     for one, ((family, env_id), lines) in zip(axes, sorted(found.items()), strict=True):
         for (level, label), seeds in sorted(lines.items()):
-            sigmas = sorted(set.intersection(*(set(by_sigma) for by_sigma in seeds)))
+            sigmas, ends = means_at(seeds)
             if not sigmas:
                 continue
-            ends = means(np.array([[by_sigma[s] for s in sigmas] for by_sigma in seeds]))
             look = shaded(label, regimes.index(level))
             text = name_of(label) if label == DENSE else f"{name_of(label)}, {percent(1 - level)}"
             line(one, sigmas, ends, look, text)

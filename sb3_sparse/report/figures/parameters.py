@@ -10,16 +10,15 @@ import numpy as np
 from sb3_sparse.report.backend import Axes
 from sb3_sparse.report.figures.base import (
     Drawing,
-    NotEnoughData,
+    estimates_line,
     figure,
     legend,
-    line,
     logarithmic,
     panels,
 )
 from sb3_sparse.report.methods import DENSE, EQUAL, in_order, look_of, name_of, percent
 from sb3_sparse.report.statistics import mean
-from sb3_sparse.report.study import Study
+from sb3_sparse.report.study import NotEnoughData, Study
 
 HEADS = (
     "family",
@@ -87,9 +86,8 @@ def _panel(one: Axes, study: Study, family: str, env_id: str) -> list[list[Any]]
             _horizontal(one, points[0][2].value, points[0][2].low, points[0][2].high)
             continue
         points.sort(key=lambda point: point[0])
-        ends = [np.array([getattr(p[2], end) for p in points]) for end in ("value", "low", "high")]
         look = look_of(label)
-        line(one, [p[0] for p in points], (ends[0], ends[1], ends[2]), look, name_of(label))
+        estimates_line(one, [p[0] for p in points], [p[2] for p in points], look, name_of(label))
         if label != EQUAL and not annotated:
             annotated = True
             for parameters, level, e in points:

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from sb3_sparse.report.figures.base import Drawing, NotEnoughData, figure, legend, line, panels
+from sb3_sparse.report.figures.base import Drawing, figure, legend, line, panels
 from sb3_sparse.report.methods import look_of, name_of, percent
-from sb3_sparse.report.scores import panels_of, why_not
+from sb3_sparse.report.scores import panels_of
 from sb3_sparse.report.statistics import profile
 from sb3_sparse.report.study import Study
 
@@ -25,8 +25,6 @@ POINTS, REPS = 61, 1000
 def draw(study: Study) -> Drawing:
     """A panel a sparsity, a line a method."""
     found, remarks = panels_of(study)
-    if not found:
-        raise NotEnoughData(why_not(study, remarks))
     made, axes = panels(len(found))
     rows: list[list[Any]] = []
     for one, (family, level, scores, tasks) in zip(axes, found, strict=True):

@@ -5,13 +5,17 @@ from __future__ import annotations
 from collections import defaultdict
 from typing import Any
 
-import numpy as np
-
 from sb3_sparse.report.data import RunData
-from sb3_sparse.report.figures.base import Drawing, NotEnoughData, figure, legend, line, panels
+from sb3_sparse.report.figures.base import (
+    Drawing,
+    estimates_line,
+    figure,
+    legend,
+    panels,
+)
 from sb3_sparse.report.methods import DENSE, name_of, percent, shaded
 from sb3_sparse.report.statistics import mean
-from sb3_sparse.report.study import Study
+from sb3_sparse.report.study import NotEnoughData, Study
 
 HEADS = (
     "family",
@@ -59,13 +63,10 @@ def draw(study: Study) -> Drawing:
             estimates = {x: mean([run.score for run in runs]) for x, runs in sorted(shares.items())}
             for x, e in estimates.items():
                 rows.append([family, env_id, label, budget, x, e.value, e.low, e.high, e.seeds])
-            ends = [
-                np.array([getattr(e, end) for e in estimates.values()])
-                for end in ("value", "low", "high")
-            ]
             look = shaded(label, budgets.index(budget))
             text = f"{name_of(label)}, {percent(budget)} of parameters"
-            line(one, [100 * x for x in estimates], (ends[0], ends[1], ends[2]), look, text)
+            shown = [100 * x for x in estimates]
+            estimates_line(one, shown, list(estimates.values()), look, text)
         usual = _usual(study, family, env_id)
         if usual is not None:
             one.axvline(100 * usual, color="#999999", linewidth=0.9, linestyle=":")

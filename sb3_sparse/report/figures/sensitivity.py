@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
 from sb3_sparse.report.data import RunData
-from sb3_sparse.report.figures.base import Drawing, NotEnoughData, figure, legend, line, panels
+from sb3_sparse.report.figures.base import (
+    Drawing,
+    estimates_line,
+    figure,
+    legend,
+    panels,
+)
 from sb3_sparse.report.methods import DENSE, in_order, look_of, name_of, percent
 from sb3_sparse.report.statistics import mean
-from sb3_sparse.report.study import Study
+from sb3_sparse.report.study import NotEnoughData, Study
 
 HEADS = ("family", "environment", "sparsity", "method", "setting", "value", "mean score", "low") + (
     "high",
@@ -55,11 +59,8 @@ def draw(study: Study) -> Drawing:
             place: list[Any] = [family, env_id, level, label, name]
             for value, e in zip(shown, estimates, strict=True):
                 rows.append([*place, value, e.value, e.low, e.high, e.seeds])
-            ends = [
-                np.array([getattr(e, end) for e in estimates]) for end in ("value", "low", "high")
-            ]
             x = [float(ticks.index(value)) for value in shown]
-            line(one, x, (ends[0], ends[1], ends[2]), look_of(label), name_of(label))
+            estimates_line(one, x, estimates, look_of(label), name_of(label))
         one.set_xticks(range(len(ticks)), [str(value) for value in ticks])
         one.set_xlabel(name)
         one.set_ylabel("mean score")

@@ -5,11 +5,8 @@ from __future__ import annotations
 from collections import defaultdict
 from typing import Any
 
-import numpy as np
-
 from sb3_sparse.report.figures.base import (
     Drawing,
-    NotEnoughData,
     figure,
     legend,
     line,
@@ -18,8 +15,8 @@ from sb3_sparse.report.figures.base import (
 )
 from sb3_sparse.report.measured import series
 from sb3_sparse.report.methods import DENSE, name_of, percent, shaded
-from sb3_sparse.report.statistics import means
-from sb3_sparse.report.study import Study
+from sb3_sparse.report.statistics import means_at
+from sb3_sparse.report.study import NotEnoughData, Study
 
 HEADS = (
     "family",
@@ -66,10 +63,9 @@ def draw(study: Study) -> Drawing:
     rows: list[list[Any]] = []
     for one, ((family, env_id, network), lines) in zip(axes, sorted(found.items()), strict=True):
         for (label, level), seeds in sorted(lines.items(), key=lambda item: item[0][::-1]):
-            steps = sorted(set.intersection(*({x for x, _ in points} for points in seeds)))
+            steps, ends = means_at([dict(points) for points in seeds])
             if not steps:
                 continue
-            ends = means(np.array([[dict(points)[x] for x in steps] for points in seeds]))
             look = shaded(label, levels.index(level))
             text = name_of(label) if label == DENSE else f"{name_of(label)}, {percent(level)}"
             line(one, steps, ends, look, text)
