@@ -1,6 +1,28 @@
 from __future__ import annotations
 
+import sys
+
+import pytest
 import support  # noqa: F401  (registers environments and a third-party method)
 import torch as th
 
 th.set_num_threads(1)
+
+
+@pytest.fixture
+def mistake(tmp_path, monkeypatch, capsys):
+    """Runs a command that must end with an error of the user's, and gives its one line."""
+
+    def call(*args: str) -> str:
+        from sb3_sparse.cli import main
+
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr(sys, "argv", ["sb3-sparse", *args])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        assert ended.value.code == 2
+        (line,) = capsys.readouterr().err.strip().splitlines()
+        assert line.startswith("Error: ")
+        return line
+
+    return call

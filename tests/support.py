@@ -104,7 +104,8 @@ def make(algorithm, env=None, policy="SparsePolicy", policy_kwargs=None, **kwarg
         algorithm = ALGORITHMS[algorithm]
     if env is None:
         env = "CartPole-v1" if algorithm.__name__ in DISCRETE else "Pendulum-v1"
-    policy_kwargs = {"net_arch": [24, 24], **(policy_kwargs or {})}
+    few = {"n_quantiles": 20} if algorithm.__name__ == "QRDQN" else {}  # of 200 it compares pairs
+    policy_kwargs = {"net_arch": [24, 24], **few, **(policy_kwargs or {})}
     if policy.startswith("Sparse"):
         policy_kwargs = {"sparsity": 0.9, **storage, **policy_kwargs}
     arguments = {**arguments_of(algorithm), "seed": 0, "device": "cpu", **kwargs}

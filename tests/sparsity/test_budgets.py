@@ -111,7 +111,7 @@ def test_share_at_the_very_edge_leaves_one_side_dense():
 
 @pytest.mark.parametrize("share", [0, 1])
 def test_a_share_that_leaves_one_side_nothing_is_an_error(share):
-    with pytest.raises(ConfigError, match="between 0\.0001 and 0\.9999"):
+    with pytest.raises(ConfigError, match=r"between 0\.0001 and 0\.9999"):
         split_sparsity(ACTOR, CRITICS, 0.9, share)
 
 
