@@ -69,6 +69,8 @@ class Cell:
         else:
             share = "" if run.sparsity is None else f" {run.sparsity:.0%}"
             how = f"{run.method or run.conf_file or 'rigl'}{share}"
+        if run.method and run.conf_file:
+            how += f" of {run.conf_file}"
         changed = "".join(f", {name} {value}" for name, value in run.hyperparams.items())
         where = "" if run.distribution is None else f" {run.distribution}"
         return f"{run.algo} {run.env_id} {how}{where}{changed}, seed {run.seed}"

@@ -64,7 +64,8 @@ def draw(study: Study) -> Drawing:
             for x, e in estimates.items():
                 rows.append([family, env_id, label, budget, x, e.value, e.low, e.high, e.seeds])
             look = shaded(label, budgets.index(budget))
-            text = f"{name_of(label)}, {percent(budget)} of parameters"
+            name = "Dense" if label == DENSE else name_of(label)
+            text = f"{name}, {percent(budget)} of parameters"
             shown = [100 * x for x in estimates]
             estimates_line(one, shown, list(estimates.values()), look, text)
         usual = _usual(study, family, env_id)
@@ -98,6 +99,7 @@ def _usual(study: Study, family: str, env_id: str) -> float | None:
     shares: dict[str, list[float]] = defaultdict(list)
     for run in study.trained:
         if (run.family, run.env_id) == (family, env_id) and run.actor_share is not None:
-            asked = study.setting(run, "actor_share") or run.record["run"].get("hyperparams")
+            widths = "net_arch" in run.record["run"].get("hyperparams", {})
+            asked = widths or study.setting(run, "actor_share") is not None
             shares["asked" if asked else "usual"].append(run.actor_share)
     return sorted(shares["usual"])[len(shares["usual"]) // 2] if shares["usual"] else None
