@@ -15,7 +15,7 @@ from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_sparse.errors import MissingExtra
 from sb3_sparse.zoo.checkpoint import REPLAY_BUFFER
@@ -162,7 +162,7 @@ def envs_of_run(
     """Environments with the wrappers, stacking and normalisation of a finished run.
 
     :param params: folder of the run's ``config.yml`` and normalisation
-    :param n_envs: how many side by side
+    :param n_envs: how many side by side, in this process
     :param wrappers: further ones, around those of the run but below stacking and normalisation;
         each a path to its arguments, as in rl-zoo's ``env_wrapper``
     """
@@ -178,6 +178,7 @@ def envs_of_run(
         should_render=False,
         hyperparams=hyperparams,
         env_kwargs={**hyperparams.pop("env_kwargs", {}), **env_kwargs},
+        vec_env_cls=DummyVecEnv,
     )
     return env
 

@@ -12,8 +12,10 @@ from collections.abc import Sequence
 import pytest
 import torch as th
 import yaml
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_sparse.experiments import Study, run_study, standing_of
+from sb3_sparse.experiments.noise import noisy_envs
 from sb3_sparse.experiments.work import work_on
 from sb3_sparse.launch.base import Ended, Launcher, Task
 from sb3_sparse.zoo.record import read_record
@@ -179,6 +181,14 @@ def test_noise_is_measured_of_the_trained_model_without_training_it_again(traine
     assert [float(row["sigma"]) for row in rows] == [0.0] * 3 + [2.0] * 3
     assert all(1 <= float(row["return"]) <= 500 for row in rows)
     assert standing_of(noisy.cells[1], copy).status == "done"
+
+
+def test_ten_noisy_environments_are_of_one_process(trained):
+    made, store = trained
+    _, with_noise = noisy_envs(made.cells[0].folder(store), "CartPole-v1", "dqn")
+    envs = with_noise(1.0)
+    assert isinstance(envs.unwrapped, DummyVecEnv)
+    assert envs.num_envs == 10
 
 
 def test_what_is_measured_during_training_lies_beside_the_evaluations(tmp_path):
