@@ -9,9 +9,11 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
+from sb3_sparse.callback import SparsityCallback
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.experiments.cell import Cell
 from sb3_sparse.experiments.measures import Measures
+from sb3_sparse.topology import method_named
 from sb3_sparse.zoo.configs import read_yaml
 from sb3_sparse.zoo.run import Run
 from sb3_sparse.zoo.settings import find_callback
@@ -136,15 +138,21 @@ def _cells(content: Mapping[str, Any], of_scale: Any) -> Iterator[Cell]:
             cell = Cell(Run(**arguments, seed=seed), measures, trained)
             if cell.address not in seen:
                 seen.add(cell.address)
+                callback = find_callback(cell.run.settings())
+                if callback is not None:
+                    SparsityCallback(**callback)  # refuses here what it would refuse in the run
                 yield cell
 
 
 def _with_schedule(arguments: dict[str, Any], schedule: Mapping[str, Any]) -> dict[str, Any]:
-    """With a scale's ``schedule``, where masks move."""
+    """With what of a scale's ``schedule`` the method takes: nothing where masks stand still."""
     run = Run(**arguments)
-    if not schedule or find_callback(run.settings()) is None:
+    callback = find_callback(run.settings()) if schedule else None
+    if callback is None:
         return arguments
-    return {**arguments, "hyperparams": {**schedule, **run.hyperparams}}
+    options = method_named(callback["method"]).options
+    taken = {name: value for name, value in schedule.items() if name in options}
+    return {**arguments, "hyperparams": {**taken, **run.hyperparams}}
 
 
 def _block(common: Any, block: Any, scale: Mapping[str, Any]) -> dict[str, Any]:

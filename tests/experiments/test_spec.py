@@ -93,9 +93,12 @@ def test_a_scale_leaves_out_sparsities_methods_and_environments(tmp_path):
 
 def test_a_scales_schedule_is_for_masks_that_move(tmp_path):
     scales = {"smoke": {"schedule": {"update_interval": 7}}}
-    runs = [cell.run for cell in read(tmp_path, scales=scales).cells]
-    assert all(r.hyperparams == {} for r in runs if r.method == "dense")
-    assert all(r.hyperparams == {"update_interval": 7} for r in runs if r.method != "dense")
+    methods = [{"method": "dense"}, {"method": ["static", "set", "prune"], "sparsity": 0.5}]
+    runs = [cell.run for cell in read(tmp_path, scales=scales, runs=methods).cells]
+    still = [r for r in runs if r.method in ("dense", "static")]
+    assert len(runs) == 2 * len(still) > 0
+    assert all(r.hyperparams == {} for r in still)
+    assert all(r.hyperparams == {"update_interval": 7} for r in runs if r not in still)
 
 
 @pytest.mark.parametrize(
@@ -118,6 +121,10 @@ def test_a_scales_schedule_is_for_masks_that_move(tmp_path):
         ({"scales": {"smoke": {"schedule": 3}}}, "schedule must be a mapping, got 3"),
         ({"runs": [{"method": "dense", "vary": {"gamma": 0.9}}]}, "vary must map"),
         ({"runs": [{"method": "dense", "vary": {"gama": [0.9]}}]}, "did you mean 'gamma'"),
+        (
+            {"runs": [{"method": "static", "sparsity": 0.5, "vary": {"update_interval": [5]}}]},
+            "method 'static' has no update_interval",
+        ),
         ({"runs": [{"method": "dense", "sparsity": 0.9}]}, "dense training has no sparsity"),
     ],
 )

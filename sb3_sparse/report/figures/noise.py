@@ -43,8 +43,8 @@ def draw(study: Study) -> Drawing:
             if not sigmas:
                 continue
             look = shaded(label, regimes.index(level))
-            text = name_of(label) if label == DENSE else f"{name_of(label)}, {percent(1 - level)} kept"
-            line(one, sigmas, ends, look, text)
+            kept = "" if label == DENSE else f", {percent(1 - level)} kept"
+            line(one, sigmas, ends, look, f"{name_of(label)}{kept}")
             for sigma, *values in zip(sigmas, *ends, strict=True):
                 place: list[Any] = [family, env_id, label, 1 - level, sigma]
                 rows.append([*place, *map(float, values), len(seeds)])
