@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import signal
 import sys
 
 import pytest
@@ -7,6 +8,8 @@ import support  # noqa: F401  (registers environments and a third-party method)
 import torch as th
 
 th.set_num_threads(1)
+# A suite that a script starts in the background ignores Ctrl-C, and what it starts would, too.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture

@@ -75,7 +75,7 @@ class Study:
             raise ConfigError(f"{path}: figures must be a list of names, got {figures!r}")
         scales = content["scales"]
         if not isinstance(scales, Mapping) or scale not in scales:
-            known = ", ".join(scales) if isinstance(scales, Mapping) else repr(scales)
+            known = isinstance(scales, Mapping) and ", ".join(scales) or repr(scales)
             raise ConfigError(f"{path} has no scale {scale!r}, only {known}")
         try:
             cells = tuple(_cells(content, scales[scale] or {}))
@@ -163,6 +163,11 @@ def _block(common: Any, block: Any, scale: Mapping[str, Any]) -> dict[str, Any]:
     """
     for given, where in ((common, "common"), (block, "a block of runs")):
         check_keys(given, RUN_KEYS | {VARY}, where)
+    for part in (common, block, scale):
+        if not isinstance(part.get("hyperparams") or {}, Mapping):
+            raise ConfigError(
+                f"hyperparams must be a mapping, e.g. gamma: 0.98, got {part['hyperparams']!r}"
+            )
     made: dict[str, Any] = deepcopy({**common, **block})
     made["hyperparams"] = {
         name: value

@@ -78,6 +78,8 @@ class Run:
             check_distribution(self.distribution)
         for name in ("n_timesteps", "n_envs", "eval_freq", "eval_episodes"):
             value = getattr(self, name)
+            if value is not None and type(value) is not int:
+                raise ConfigError(f"{name} must be a whole number, e.g. 100000, got {value!r}")
             if value is not None and value < 1:
                 raise ConfigError(f"{name} must be 1 or more, got {value}")
         if not 0 <= self.seed < 2**31:
