@@ -101,8 +101,8 @@ def _panel(one: Axes, study: Study, family: str, env_id: str) -> list[list[Any]]
                 one.axvline(known[marked], color="#999999", linewidth=0.9, linestyle=":")
     one.margins(x=0.1, y=0.12)
     sizes = {float(row[4]) for row in rows if row[2] != DENSE}
-    if len(sizes) == 1:
-        one.set_xlim(min(sizes) / 2, min(sizes) * 2)
+    if max(sizes) < 1.5 * min(sizes):
+        one.set_xlim(min(sizes) / 2, max(sizes) * 2)
     logarithmic(one, "x")
     one.set_title(f"{family}\n{env_id}")
     one.set_xlabel("parameters")
