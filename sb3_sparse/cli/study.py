@@ -12,7 +12,7 @@ from rich.table import Table
 
 from sb3_sparse.cli.common import INTERRUPTED, Address, Launcher, console, text
 from sb3_sparse.cli.studyprogress import StudyProgress
-from sb3_sparse.errors import MissingExtra
+from sb3_sparse.errors import ConfigError, MissingExtra
 
 if TYPE_CHECKING:
     from sb3_sparse.experiments import Study
@@ -34,7 +34,11 @@ def list_() -> None:
 
     table = Table("study", "what", *SCALES, box=None, header_style="bold")
     for name in study_names():
-        scales = [Study.read(name, scale) for scale in SCALES]
+        try:
+            scales = [Study.read(name, scale) for scale in SCALES]
+        except MissingExtra as error:
+            table.add_row(name, str(error))
+            continue
         table.add_row(name, scales[0].title, *(str(len(study.cells)) for study in scales))
     console.print(table)
     console.print("Numbers are runs. Go on with: sb3-sparse study run NAME --scale SCALE")
@@ -73,11 +77,15 @@ def run(
     if last.elsewhere:
         console.print(f"{last.elsewhere} runs are trained by other processes; look again with:")
         console.print(_command("status", name, scale, store), soft_wrap=True)
+    alike: dict[str, list[str]] = {}
     for failed, error in last.failed.items():
-        console.print(f"\nFailed twice: {failed}", markup=False, style="bold", soft_wrap=True)
-        console.print(error.rstrip(), markup=False, soft_wrap=True)
-    console.print(f"{last.done} of {last.planned} runs are done. Draw them:")
-    console.print(_command("report", name, scale, store), soft_wrap=True)
+        alike.setdefault(error.rstrip(), []).append(failed)
+    for error, runs in alike.items():
+        console.print(f"\nFailed twice: {'; '.join(runs)}", markup=False, style="bold")
+        console.print(error, markup=False, soft_wrap=True)
+    console.print(f"{last.done} of {last.planned} runs are done.")
+    if last.done:
+        console.print(f"Draw them: {_command('report', name, scale, store)}", soft_wrap=True)
     if last.failed:
         raise typer.Exit(1)
 
@@ -119,14 +127,18 @@ def report(
 
     study = Study.read(name, scale)
     standings = _standings(study, store)
+    folders = [one.folder for one in standings if one.folder.is_dir()]
+    if not folders:
+        command = _command("run", name, scale, store)
+        raise ConfigError(f"there is no run of this study in {store} yet; begin with: {command}")
     page = write_report(
-        [one.folder for one in standings if one.folder.is_dir()],
+        folders,
         out or store / study.report_folder,
         title=f"{study.title} ({scale})",
         figures=study.figures,
         varies=study.varies,
         command=_command("run", name, scale, store),
-        pending=[one.cell.name for one in standings if one.status != "done"],
+        pending=[_pending(one, store) for one in standings if one.status != "done"],
     )
     console.print(f"Written: {page}", soft_wrap=True)
 
@@ -138,6 +150,11 @@ def _check_figures(study: Study) -> None:
     except MissingExtra:
         return
     check_figures(study.figures)
+
+
+def _pending(one: CellStanding, store: Path) -> str:
+    failed = f": failed, see {one.cell.errors(store)}" if one.status == "failed" else ""
+    return f"{one.cell.name}{failed}"
 
 
 def _standings(study: Study, store: Path) -> list[CellStanding]:

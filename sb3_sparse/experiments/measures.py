@@ -50,6 +50,18 @@ class Measures:
             {name: dict(given[name]) for name in AFTER if name in given},
         )
 
+    def check(self, algorithm: type[Any]) -> None:
+        """Refuse an algorithm that cannot be measured so.
+
+        :raises ConfigError: and say which can
+        """
+        if "snr" in self.during:
+            from sb3_sparse.analysis.losses import LOSSES
+
+            if algorithm not in LOSSES:
+                known = ", ".join(one.__name__ for one in LOSSES)
+                raise ConfigError(f"snr is measured of {known}, got {algorithm.__name__}")
+
     def callbacks(self, folder: Path) -> list[Any]:
         """New callbacks that write into a run's folder."""
         if not self.during:

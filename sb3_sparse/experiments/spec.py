@@ -70,10 +70,11 @@ class Study:
         for key in ("title", "figures", "runs", "scales"):
             if key not in content:
                 raise ConfigError(f"{path} lacks {key!r} (docs/studies.md)")
-        figures = content["figures"]
-        if not isinstance(figures, list) or not all(isinstance(one, str) for one in figures):
+        figures, scales = content["figures"], content["scales"]
+        if not figures or not isinstance(figures, list) or set(map(type, figures)) != {str}:
             raise ConfigError(f"{path}: figures must be a list of names, got {figures!r}")
-        scales = content["scales"]
+        if "sensitivity" in figures and "varies" not in content:
+            raise ConfigError(f"{path}: the figure sensitivity needs varies, a setting's name")
         if not isinstance(scales, Mapping) or scale not in scales:
             known = isinstance(scales, Mapping) and ", ".join(scales) or repr(scales)
             raise ConfigError(f"{path} has no scale {scale!r}, only {known}")
@@ -136,6 +137,7 @@ def _cells(content: Mapping[str, Any], of_scale: Any) -> Iterator[Cell]:
     for seed in range(seeds):
         for arguments in runs:
             cell = Cell(Run(**arguments, seed=seed), measures, trained)
+            measures.check(cell.run.algorithm)
             if cell.address not in seen:
                 seen.add(cell.address)
                 callback = find_callback(cell.run.settings())

@@ -164,7 +164,7 @@ def _left_out(content: Content) -> str:
 
 
 def _pending(content: Content) -> str:
-    parts = [html.paragraph(f"{len(content.pending)} cells are planned and not done.")]
+    parts = [html.paragraph(f"Runs that are planned and not done: {len(content.pending)}.")]
     if content.pending:
         parts.append(html.folded("Which", html.listing(content.pending)))
     if content.command:

@@ -113,6 +113,12 @@ def test_a_scales_schedule_is_for_masks_that_move(tmp_path):
         ({"measures": {"snr": {"every": 0}}}, "every of measure snr must be a whole number"),
         ({"measures": {"noise": {"sigmas": 3}}}, "sigmas of measure noise must be a list"),
         ({"figures": "iqm"}, "figures must be a list of names, got 'iqm'"),
+        ({"figures": []}, "figures must be a list of names, got []"),
+        ({"figures": ["sensitivity"]}, "the figure sensitivity needs varies"),
+        (
+            {"common": {"algo": "a2c", "env_id": "CartPole-v1"}, "measures": {"snr": {"every": 9}}},
+            "snr is measured of DQN, SAC, PPO, got A2C",
+        ),
         ({"trained": "no"}, "trained must be true or false, got 'no'"),
         ({"runs": {"method": "dense"}}, "runs must be a list of blocks"),
         ({"scales": {"smoke": {"n_timesteps": "4e3"}}}, "n_timesteps must be a whole number"),

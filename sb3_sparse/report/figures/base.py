@@ -26,6 +26,7 @@ from sb3_sparse.report.study import Study
 
 WIDTH, HEIGHT, COLUMNS = 3.4, 2.7, 3
 SPARE = 0.5
+ENTRY, LETTER = 0.6, 0.075  # inches of a legend's column: its mark, and a letter of its text
 STYLE: Any = {
     "font.size": 9,
     "axes.titlesize": 9,
@@ -149,7 +150,7 @@ def logarithmic(one: Axes, which: str) -> None:
     axis.set_minor_formatter(NullFormatter())
 
 
-def legend(made: Figure, axes: Sequence[Axes], columns: int = 3) -> None:
+def legend(made: Figure, axes: Sequence[Axes]) -> None:
     """One legend below all panels, each entry once; and the panels' heights by their lines."""
     found: dict[str, Any] = {}
     for one in axes:
@@ -157,9 +158,11 @@ def legend(made: Figure, axes: Sequence[Axes], columns: int = 3) -> None:
         for handle, label in zip(*one.get_legend_handles_labels(), strict=True):
             found.setdefault(label, handle)
     if found:
+        entry = ENTRY + LETTER * max(map(len, found))
+        columns = max(1, int(made.get_figwidth() / entry))
         made.legend(
             list(found.values()), list(found), loc="outside lower center",
-            ncols=min(columns * max(1, round(made.get_figwidth() / 6)), len(found)),
+            ncols=min(columns, len(found)),
         )  # fmt: skip
 
 

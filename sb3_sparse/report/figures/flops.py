@@ -10,6 +10,7 @@ from sb3_sparse.report.methods import DENSE, EQUAL
 from sb3_sparse.report.study import NotEnoughData, Study
 
 HEADS = ("family", "environment", "distribution", "sparsity", "flops", "dense flops", "share")
+NAMES = {"erk": "ERK", "er": "ER"}
 DRAWN = {
     "erk": ("#362682", "o", "-"),
     "er": ("#009E73", "^", "-."),
@@ -40,14 +41,21 @@ def draw(study: Study) -> Drawing:
             color, marker, style = DRAWN.get(kind, ("#444444", "D", ":"))
             levels = sorted(counts)
             shares = [counts[level][0] / counts[level][1] for level in levels]
-            one.plot(levels, shares, color=color, marker=marker, linestyle=style, label=kind)
+            one.plot(
+                levels,
+                shares,
+                color=color,
+                marker=marker,
+                linestyle=style,
+                label=NAMES.get(kind, kind),
+            )
             for level, share in zip(levels, shares, strict=True):
                 rows.append([family, env_id, kind, level, *counts[level], share])
         one.set_title(f"{family}\n{env_id}")
         one.set_xlabel("sparsity")
         one.set_ylabel("FLOPs, share of dense")
         one.set_ylim(bottom=0)
-        one.xaxis.set_major_formatter(PercentFormatter(1.0, symbol=" %"))
-        one.yaxis.set_major_formatter(PercentFormatter(1.0, symbol=" %"))
+        one.xaxis.set_major_formatter(PercentFormatter(1.0, decimals=0, symbol=" %"))
+        one.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0, symbol=" %"))
     legend(made, axes)
     return Drawing(made, HEADS, rows)

@@ -78,7 +78,7 @@ def draw(study: Study) -> Drawing:
         one.set_title(f"{family}\n{env_id}")
         one.set_xlabel("actor's share of connections, %")
         one.set_ylabel("mean score")
-    legend(made, axes, columns=2)
+    legend(made, axes)
     return Drawing(made, HEADS, rows)
 
 
