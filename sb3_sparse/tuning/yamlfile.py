@@ -132,7 +132,8 @@ class _Entry:
                 continue
             first = known.lc.key(name)[0]
             last, old = self._end(first), known[name]
-            if isinstance(old, CommentedMap) and isinstance(value, Mapping) and last > first + 1:
+            block = isinstance(old, CommentedMap) and last > first + 1
+            if block and isinstance(value, Mapping) and set(old) <= set(value):
                 edits += self._edits(old, value, last)
             else:
                 new = self._dumped(name, value, column)
