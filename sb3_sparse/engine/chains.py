@@ -63,7 +63,7 @@ class Chain:
             structures.append(structure)
             parameters += [values, layer.bias]
         how = Pass(self.relus, structures, self._references, batch, tiled_in, tiled_out)
-        if _watched(x):
+        if watched(x):
             return how.by_dense_weights(x, parameters)
         if th.is_grad_enabled() and (
             x.requires_grad or any(p is not None and p.requires_grad for p in parameters)
@@ -75,7 +75,7 @@ class Chain:
         return how.forward(x, parameters)[0]
 
 
-def _watched(x: th.Tensor) -> bool:
+def watched(x: th.Tensor) -> bool:
     """Whether somebody wants to see single operations: tracing, fake tensors, torch.func."""
     return (
         type(x) not in PLAIN

@@ -149,6 +149,9 @@ class Pass(NamedTuple):
             rows, columns = structure.shape
             flat = th.from_numpy(structure.flat)
             values = parameters[2 * i]
+            if th.onnx.is_in_onnx_export():
+                # Its tracer knows the dense weights of the state_dict, not these values.
+                values = values.data
             weight = values.new_zeros(rows * columns).index_put((flat,), values)
             x = functional.linear(x, weight.view(rows, columns), parameters[2 * i + 1])
             if self.relus[i]:

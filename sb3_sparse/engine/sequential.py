@@ -9,7 +9,7 @@ import torch as th
 from torch import nn
 from torch.nn.modules.module import _has_any_global_hook
 
-from sb3_sparse.engine.chains import Chain
+from sb3_sparse.engine.chains import Chain, watched
 from sb3_sparse.engine.linear import CompactLinear
 
 ELEMENTWISE = (
@@ -36,7 +36,8 @@ HOOKS = ("_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_p
 class ChainedSequential(nn.Sequential):
     """A ``Sequential`` that runs its compact layers as chains.
 
-    Whoever hooks one of its modules gets the modules called one by one, as in torch.
+    Whoever hooks one of its modules, or traces them, gets the modules called one by one, as in
+    torch.
     """
 
     _seen: tuple[nn.Module, ...]
@@ -49,7 +50,7 @@ class ChainedSequential(nn.Sequential):
         """As of ``Sequential``."""
         modules = tuple(self._modules.values())
         hooked = any(getattr(module, hooks) for module in modules for hooks in HOOKS)
-        if hooked or _has_any_global_hook():  # type: ignore[no-untyped-call]
+        if hooked or watched(input) or _has_any_global_hook():  # type: ignore[no-untyped-call]
             y: th.Tensor = super().forward(input)  # type: ignore[no-untyped-call]
             return y
         if modules != self._seen:
