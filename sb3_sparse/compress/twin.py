@@ -19,7 +19,7 @@ from sb3_sparse.engine.masked import MaskedLayer
 from sb3_sparse.errors import ConfigError, UnsupportedError
 from sb3_sparse.policies.aliases import supported_algorithms
 from sb3_sparse.policies.mixin import SparsePolicyMixin
-from sb3_sparse.policies.saving import parts_of
+from sb3_sparse.policies.saving import load_without_buffer, parts_of
 from sb3_sparse.sparsity.selection import largest
 
 Algorithm = TypeVar("Algorithm", bound=BaseAlgorithm)
@@ -92,12 +92,12 @@ def load_beside(
 
     :param force_reset: whether it begins with a reset of the environment
     """
-    own: dict[str, Any] = {}
-    if isinstance(model, OffPolicyAlgorithm):
-        own["replay_buffer"] = model.replay_buffer
-    return type(model).load(
-        file, env=model.env, device=model.device, force_reset=force_reset, **own
+    loaded = load_without_buffer(
+        type(model), file, env=model.env, device=model.device, force_reset=force_reset
     )
+    if isinstance(model, OffPolicyAlgorithm):
+        vars(loaded)["replay_buffer"] = model.replay_buffer
+    return loaded
 
 
 def sparse_policy(model: BaseAlgorithm) -> SparsePolicyMixin:

@@ -25,9 +25,11 @@ from sb3_sparse.export.c import write_c
 from sb3_sparse.export.dense import write_dense
 from sb3_sparse.export.graph import Graph
 from sb3_sparse.export.npz import write_npz
+from sb3_sparse.export.observations import Observations, count_of
 from sb3_sparse.export.parity import Actor
 from sb3_sparse.export.units import sort_units
 from sb3_sparse.policies.mixin import SparsePolicyMixin
+from sb3_sparse.policies.saving import load_without_buffer
 
 COMPILERS = ("cc", "gcc", "clang")
 OPTIONS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror")
@@ -108,8 +110,7 @@ def dense_artifact(model: BaseAlgorithm, normalised: bool) -> Artifact:
     content = write_dense(model)
 
     def actor() -> Actor:
-        small: Any = {"buffer_size": 1} if hasattr(model, "buffer_size") else {}
-        stock = type(model).load(io.BytesIO(content), device="cpu", **small)
+        stock = load_without_buffer(type(model), io.BytesIO(content), device="cpu")
         return predictor(stock, None)
 
     notes = ["trained on in stock SB3, it is dense: nothing keeps the zeros"]
@@ -126,12 +127,12 @@ def dense_artifact(model: BaseAlgorithm, normalised: bool) -> Artifact:
 def predictor(model: BaseAlgorithm, normalization: VecNormalize | None) -> Actor:
     """A model's own ``predict``, behind its normalisation."""
 
-    def run(observations: NDArray[Any]) -> NDArray[Any]:
-        seen: Any = observations
+    def run(observations: Observations) -> NDArray[Any]:
+        seen = observations
         if normalization is not None:
             seen = normalization.normalize_obs(observations)
         actions, _ = model.predict(seen, deterministic=True)
-        return np.asarray(actions).reshape(len(observations), -1)
+        return np.asarray(actions).reshape(count_of(observations), -1)
 
     return run
 

@@ -6,9 +6,8 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.preprocessing import maybe_transpose
+from stable_baselines3.common.preprocessing import is_image_space, maybe_transpose
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 
@@ -74,10 +73,10 @@ def record_observations(model: BaseAlgorithm, env: VecEnv, count: int) -> Observ
     :raises ConfigError: if the environment shows other observations than the model takes, or takes
         other actions
     """
-    shown, taken = env.observation_space.shape, model.observation_space.shape
-    if shown != taken and (shown is None or (*shown[2:], *shown[:2]) != taken):
+    if not _fits(env.observation_space, model.observation_space):
+        shown, taken = _said(env.observation_space, model.observation_space)
         raise ConfigError(
-            f"the environment shows observations of shape {shown}, the model takes {taken}; a "
+            f"the environment shows observations {shown}, the model takes {taken}; a "
             "run's folder tells which wrappers and stacked frames belong to it, a zip does not"
         )
     there, here = env.action_space, model.action_space
@@ -111,27 +110,73 @@ def record_observations(model: BaseAlgorithm, env: VecEnv, count: int) -> Observ
     return np.concatenate([maybe_transpose(part, space) for part in found])[:count]
 
 
+def _fits(shown: Any, taken: Any) -> bool:
+    """Whether a policy takes what an environment shows; images may have their channels last."""
+    if isinstance(taken, spaces.Dict):
+        return (
+            isinstance(shown, spaces.Dict)
+            and shown.spaces.keys() == taken.spaces.keys()
+            and all(_fits(shown[key], part) for key, part in taken.spaces.items())
+        )
+    if isinstance(taken, spaces.Box) and isinstance(shown, spaces.Box):
+        return taken.shape in (shown.shape, (*shown.shape[2:], *shown.shape[:2]))
+    return bool(shown == taken)
+
+
+def _said(shown: Any, taken: Any) -> tuple[str, str]:
+    """How to call what differs between two spaces."""
+    if isinstance(shown, spaces.Box) and isinstance(taken, spaces.Box):
+        return f"of shape {shown.shape}", f"{taken.shape}"
+    return f"in {shown}", f"those in {taken}"
+
+
 def _raw(normalization: VecNormalize, seen: Observations) -> Observations:
     raw: Any = normalization.get_original_obs()
-    return seen if np.shape(raw) != np.shape(seen) else raw
+    if isinstance(seen, dict):
+        stacked = any(np.shape(raw[key]) != np.shape(part) for key, part in seen.items())
+    else:
+        stacked = np.shape(raw) != np.shape(seen)
+    return seen if stacked else raw
 
 
-def check_recorded(observations: NDArray[Any], space: spaces.Space[Any]) -> None:
+def check_recorded(observations: Observations, space: spaces.Space[Any]) -> None:
     """Refuse recorded observations that are not finite, or not of the policy's shape.
 
     :raises ConfigError: if so
     """
-    shape = space.shape
-    if isinstance(observations, dict) != isinstance(space, spaces.Dict):
-        raise ConfigError(f"recorded observations must be of {space}, got {type(observations)}")
-    if not isinstance(observations, dict) and shape != np.shape(observations)[1:]:
+    if not isinstance(space, spaces.Dict):
+        _check_part(observations, space, "recorded observations")
+        return
+    keys = list(space.spaces)
+    if not isinstance(observations, dict) or set(observations) != set(keys):
+        got = list(observations) if isinstance(observations, dict) else type(observations).__name__
         raise ConfigError(
-            f"recorded observations must have a row for each, of shape {shape} as the policy sees "
-            f"it (images channels first), got an array of shape {np.shape(observations)}"
+            f"recorded observations must be a dict of arrays with the keys {keys}, got {got}"
         )
-    parts = observations.values() if isinstance(observations, dict) else [observations]
-    if not all(np.isfinite(part).all() for part in parts):
-        raise ConfigError("recorded observations must be finite; some are NaN or infinite")
+    for key, part in space.spaces.items():
+        _check_part(observations[key], part, f"recorded observations[{key!r}]")
+    counts = {key: len(part) for key, part in observations.items()}
+    if len(set(counts.values())) > 1:
+        raise ConfigError(
+            f"recorded observations must have as many rows for each key, got {counts}"
+        )
+
+
+def _check_part(part: Any, space: spaces.Space[Any], what: str) -> None:
+    if isinstance(part, dict) or np.ndim(part) == 0 or np.shape(part)[1:] != space.shape:
+        got = "a dict" if isinstance(part, dict) else f"an array of shape {np.shape(part)}"
+        raise ConfigError(
+            f"{what} must have a row for each, of shape {space.shape} as the policy sees "
+            f"it (images channels first), got {got}"
+        )
+    if not np.isfinite(part).all():
+        raise ConfigError(f"{what} must be finite; some are NaN or infinite")
+
+
+def has_images(space: spaces.Space[Any]) -> bool:
+    """Whether a space is one of images, or has one in it."""
+    parts = space.spaces.values() if isinstance(space, spaces.Dict) else [space]
+    return any(is_image_space(part) for part in parts)
 
 
 def count_of(observations: Observations | None) -> int:

@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
@@ -27,7 +26,12 @@ from sb3_sparse.export.artifact import (
 from sb3_sparse.export.extract import check_model, graph_of
 from sb3_sparse.export.fold import fold
 from sb3_sparse.export.graph import Argmax, Graph
-from sb3_sparse.export.observations import Observations, check_recorded, random_observations
+from sb3_sparse.export.observations import (
+    Observations,
+    check_recorded,
+    has_images,
+    random_observations,
+)
 from sb3_sparse.export.parity import TOLERANCE, Parity, ParityError, compare
 from sb3_sparse.export.quantize import quantized
 from sb3_sparse.export.units import remove_dead_units, units_of
@@ -130,7 +134,7 @@ def export(
     if observations is not None:
         check_recorded(observations, space)
     random = random_observations(
-        space, normalization, RANDOM_IMAGES if is_image_space(space) else RANDOM
+        space, normalization, RANDOM_IMAGES if has_images(space) else RANDOM
     )
     made_by = version("sb3-sparse")
     raw = small = Graph(())

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import io
 import pickle
-from typing import Any
+from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.save_util import load_from_zip_file
+
+Algorithm = TypeVar("Algorithm", bound=BaseAlgorithm)
 
 BROKEN_PICKLE = (
     pickle.UnpicklingError,
@@ -36,6 +40,23 @@ def parts_of(model: BaseAlgorithm) -> tuple[dict[str, Any], dict[str, Any], Any]
     data, params, variables = load_from_zip_file(file, device="cpu")
     assert data is not None
     return data, dict(params), variables
+
+
+def load_without_buffer(
+    algorithm: type[Algorithm], file: str | Path | io.BufferedIOBase, **kwargs: Any
+) -> Algorithm:
+    """A saved model with all its settings, but no replay buffer: for all except training.
+
+    A buffer would take memory, and that of hindsight experience replay asks for the environment.
+
+    :param kwargs: of SB3's ``load``
+    """
+    if issubclass(algorithm, OffPolicyAlgorithm):
+        kwargs["replay_buffer"] = object()  # SB3 makes one where there is none
+    model: Algorithm = algorithm.load(file, **kwargs)
+    if isinstance(model, OffPolicyAlgorithm):
+        model.replay_buffer = None
+    return model
 
 
 def was_normalised(model: BaseAlgorithm) -> bool:

@@ -18,6 +18,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_sparse.errors import MissingExtra
+from sb3_sparse.policies.saving import load_without_buffer
 from sb3_sparse.zoo.checkpoint import REPLAY_BUFFER
 from sb3_sparse.zoo.replay import end_episodes, restore_buffer
 from sb3_sparse.zoo.run import Run
@@ -194,14 +195,5 @@ def saved_settings(params: Path) -> dict[str, Any]:
 
 def load_for_prediction(algo: str, path: Path) -> BaseAlgorithm:
     """A saved model without its replay buffer."""
-    kwargs: dict[str, Any] = {}
-    algorithm = ALGOS[algo]
-    if issubclass(algorithm, OffPolicyAlgorithm):
-        kwargs = dict(
-            buffer_size=1,
-            optimize_memory_usage=False,
-            replay_buffer_class=None,
-            replay_buffer_kwargs={},
-        )
-    model: BaseAlgorithm = algorithm.load(path, **kwargs)
+    model: BaseAlgorithm = load_without_buffer(ALGOS[algo], path)
     return model
