@@ -10,7 +10,8 @@ from platform import node
 
 from sb3_sparse.tuning.backend import FrozenTrial, Trial, TrialState, optuna
 from sb3_sparse.tuning.objective import Objective
-from sb3_sparse.tuning.storage import HEARTBEAT, QueueEmpty, open_storage, retry_with
+from sb3_sparse.tuning.queue import QueueEmpty
+from sb3_sparse.tuning.storage import HEARTBEAT, open_storage, retry_with
 from sb3_sparse.tuning.study import ERROR, definition_of, find_study, standing_of
 from sb3_sparse.tuning.urls import shown_url
 

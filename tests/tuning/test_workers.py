@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import re
 import signal
-import sqlite3
 import subprocess
 import sys
 import threading
@@ -20,8 +19,9 @@ from sb3_sparse.errors import ConfigError
 from sb3_sparse.launch import Launcher
 from sb3_sparse.tuning import Space, tune
 from sb3_sparse.tuning.backend import TrialState, optuna
+from sb3_sparse.tuning.queue import QueueEmpty
 from sb3_sparse.tuning.samplers import TICKET, sampler_of
-from sb3_sparse.tuning.storage import QueueEmpty, open_storage, retry_with
+from sb3_sparse.tuning.storage import open_storage, retry_with
 from sb3_sparse.tuning.study import enter_study, standing_of, ticket_of
 from sb3_sparse.tuning.tune import define
 from sb3_sparse.tuning.worker import TooManyFailures, work
@@ -110,24 +110,6 @@ def test_a_study_holds_its_whole_budget_and_gives_nothing_else(tmp_path):
     with pytest.raises(Exception, match="^$"):
         taken.optimize(lambda trial: 0.0, n_trials=1)
     assert states(study) == {"COMPLETE": 6}
-
-
-def test_workers_that_take_trials_at_the_same_time_take_different_ones(tmp_path):
-    made(tmp_path, choices(weight_decay=[n * 1e-6 for n in range(40)]))
-    journal = tmp_path / "tune" / "journal.log"
-    taken = []
-
-    def take():
-        study = optuna.load_study(storage=open_storage(journal), study_name="study")
-        for _ in range(10):
-            study.optimize(lambda trial: taken.append(trial.number) or 0.0, n_trials=1)
-
-    threads = [threading.Thread(target=take) for _ in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert sorted(taken) == list(range(40))
 
 
 def test_a_trial_is_stale_after_three_missing_signs_and_waits_again(tmp_path):
@@ -394,23 +376,6 @@ def test_a_lock_of_a_dead_process_is_taken_over_and_that_of_a_live_one_is_not(
     entered.join(timeout=20)
     assert not entered.is_alive()
     assert [summary.study_name for summary in storage.get_all_studies()] == ["study"]
-
-
-def test_sqlite_works_too(tmp_path):
-    url = f"sqlite:///{tmp_path}/studies.db"
-    tuned = tune(
-        small_run(), choices(weight_decay=[0.0]), storage=url, log_folder=tmp_path, heartbeat=1
-    )
-    assert tuned.standing.finished
-    with sqlite3.connect(tmp_path / "studies.db") as database:
-        assert database.execute("select count(*) from trials").fetchone() == (1,)
-
-
-def test_a_damaged_journal_is_named(tmp_path):
-    path = tmp_path / "journal.log"
-    path.write_text("not json\nat all\n")
-    with pytest.raises(ConfigError, match=f"the journal {path} cannot be used"):
-        open_storage(path)
 
 
 def test_ray_completes_every_cell_once(tmp_path):

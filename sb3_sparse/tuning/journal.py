@@ -1,0 +1,199 @@
+"""Studies in a journal file, which outlives torn writes and dead workers."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+import warnings
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from optuna.storages import JournalStorage
+from optuna.storages._heartbeat import BaseHeartbeat
+from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
+from optuna.storages.journal._file import get_lock_file
+
+from sb3_sparse.tuning.backend import BaseStorage, FrozenTrial, TrialState
+from sb3_sparse.tuning.queue import FromQueue, StaleCallback
+
+RECORD = b'{"op_code":'  # how Optuna begins each line
+
+
+class JournalFile(JournalFileBackend):
+    """Optuna's journal, but a line that was not written to its end harms no other.
+
+    A full disk or a power cut can leave half a line. Optuna writes the next record behind it, and
+    can read the journal no more. Here such a tail moves into ``<journal>.torn``.
+
+    :param path: of the journal; made if it is new
+    :raises ValueError: if the file is no journal, or damaged before its last line; then it stays
+        as it is
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        lock = JournalFileOpenLock(str(path)) if os.name == "nt" else None
+        super().__init__(str(path), lock)
+        with get_lock_file(self._lock):
+            self._set_aside(_damaged_from(path))
+
+    def append_logs(self, logs: list[dict[str, Any]]) -> None:
+        """Append records, all or none."""
+        lines = "".join(f"{json.dumps(log, separators=(',', ':'))}\n" for log in logs)
+        with get_lock_file(self._lock):
+            self._set_aside(_torn_from(self.path))
+            with self.path.open("ab", buffering=0) as file:
+                end = file.tell()
+                try:
+                    written = file.write(lines.encode())
+                    if written != len(lines.encode()):
+                        raise OSError(f"the disk took {written} bytes of {len(lines)}")
+                    os.fsync(file.fileno())
+                except OSError:
+                    file.truncate(end)
+                    raise
+
+    def _set_aside(self, position: int | None) -> None:
+        """Move what lies behind a position into a file beside, and say so."""
+        if position is None:
+            return
+        aside = self.path.with_name(f"{self.path.name}.torn")
+        with self.path.open("r+b") as file:
+            file.seek(position)
+            tail = file.read()
+            with aside.open("ab") as kept:
+                kept.write(tail + b"\n")
+                kept.flush()
+                os.fsync(kept.fileno())
+            file.truncate(position)
+            os.fsync(file.fileno())
+        warnings.warn(
+            f"the last line of the journal {self.path} was not written to its end, as after a "
+            f"power cut or on a full disk; its {len(tail)} bytes are in {aside} now, and the study "
+            "goes on without them",
+            stacklevel=4,
+        )
+
+
+def _torn_from(path: Path) -> int | None:
+    """Where a last line without an end begins; None if the file ends well."""
+    with path.open("rb") as file:
+        size = file.seek(0, os.SEEK_END)
+        if size == 0:
+            return None
+        file.seek(size - 1)
+        if file.read(1) == b"\n":
+            return None
+        file.seek(0)
+        return file.read().rfind(b"\n") + 1
+
+
+def _damaged_from(path: Path) -> int | None:
+    """Where a damaged last line begins; None if all lines are records.
+
+    :raises ValueError: if another line is damaged, or nothing shows that this is a journal
+    """
+    position = 0
+    with path.open("rb") as file:
+        line, number = file.readline(), 1
+        while line:
+            following = file.readline()
+            if not _is_record(line, parse=not following):
+                if following or (number == 1 and not RECORD.startswith(line[: len(RECORD)])):
+                    raise ValueError(f"its line {number} is no record of Optuna")
+                return position
+            position += len(line)
+            line, number = following, number + 1
+    return None
+
+
+def _is_record(line: bytes, parse: bool) -> bool:
+    if not (line.startswith(RECORD) and line.endswith(b"}\n")):
+        return False
+    try:
+        return not parse or isinstance(json.loads(line), dict)
+    except ValueError:  # text or encoding
+        return False
+
+
+class QueueJournal(FromQueue, JournalStorage, BaseHeartbeat):
+    """A journal file, with what Optuna has for databases alone: signs of life.
+
+    A worker touches a file of its trial in ``<journal>.alive/``; a trial whose file has not been
+    touched for ``3 * interval`` is stale.
+
+    :param path: of the journal
+    :param interval: seconds between two signs of life
+    :param stale: called with each trial that is found stale
+    """
+
+    def __init__(self, path: Path, interval: int, stale: StaleCallback) -> None:
+        super().__init__(JournalFile(path))
+        self._alive = path.with_name(f"{path.name}.alive")
+        self._alive.mkdir(exist_ok=True)
+        self._interval, self._stale = interval, stale
+
+    def record_heartbeat(self, trial_id: int) -> None:
+        """Touch the trial's file; where that fails, the next time will do."""
+        with suppress(OSError):
+            (self._alive / str(trial_id)).touch()
+
+    def set_trial_state_values(
+        self, trial_id: int, state: TrialState, values: Sequence[float] | None = None
+    ) -> bool:
+        """As in Optuna; a trial that is over needs no file."""
+        changed = super().set_trial_state_values(trial_id, state, values)
+        if state.is_finished():
+            (self._alive / str(trial_id)).unlink(missing_ok=True)
+        return changed
+
+    def _get_stale_trial_ids(self, study_id: int) -> list[int]:
+        with tempfile.TemporaryFile(dir=self._alive) as new:
+            now = os.fstat(new.fileno()).st_mtime  # by the clock of the files, whoever asks
+        running = self.get_all_trials(study_id, deepcopy=False, states=(TrialState.RUNNING,))
+        return [
+            trial._trial_id
+            for trial in running
+            if now - self._last_sign(trial) > 3 * self._interval
+        ]
+
+    def _last_sign(self, trial: FrozenTrial) -> float:
+        try:
+            return (self._alive / str(trial._trial_id)).stat().st_mtime
+        except FileNotFoundError:  # taken this moment, or killed before its first sign
+            assert trial.datetime_start is not None
+            return trial.datetime_start.timestamp()
+
+    def get_heartbeat_interval(self) -> int | None:
+        """Seconds between two signs of life."""
+        return self._interval
+
+    def get_heartbeat_stale_trial_callback(self) -> StaleCallback | None:
+        """What is called with each stale trial."""
+        return self._stale
+
+    get_failed_trial_callback = get_heartbeat_stale_trial_callback
+
+
+def open_journal(path: Path, interval: int, stale: StaleCallback) -> BaseStorage:
+    """A journal that workers take trials from, made if it is new.
+
+    :param path: of the file
+    :param interval: seconds between two signs of life
+    :param stale: called with each trial that is found stale
+    :raises ValueError: if it is damaged before its last line, or no journal
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return QueueJournal(path, interval, stale)
+
+
+def read_journal(path: Path) -> BaseStorage:
+    """A journal to be looked at; nothing is written, and half a last line is passed over.
+
+    :raises ValueError: if it is damaged before its last line, or no journal
+    """
+    _damaged_from(path)
+    return JournalStorage(JournalFileBackend(str(path)))
