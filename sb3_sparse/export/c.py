@@ -13,9 +13,7 @@ from sb3_sparse.export import ckernels
 from sb3_sparse.export.graph import (
     Activation,
     Add,
-    Affine,
     Argmax,
-    Clip,
     Conv,
     Flatten,
     Graph,
@@ -23,6 +21,7 @@ from sb3_sparse.export.graph import (
     MaxPool,
     Node,
     Normalize,
+    PerUnit,
     Positive,
     Weighted,
 )
@@ -75,7 +74,7 @@ def write_c(graph: Graph, version: str, int8: bool = False) -> CSource:
     ]
     comment = "/*\n" + "".join(f" * {line}\n" for line in about) + " */\n"
     includes = "#include <stdint.h>\n"
-    if any(name in functions for name in ("tanhf", "expm1f")):
+    if any(f"{name}(" in functions for name in ckernels.MATH):
         includes = "#include <math.h>\n" + includes
     source = (
         f"{comment}{includes}\n{PROTOTYPE};\n\n{memory}{functions}\n{tables}\n\n"
@@ -119,7 +118,7 @@ class _Writer:
             self.functions["argmax"] = ckernels.ARGMAX
             sizes = self._table("sizes", node.sizes, "uint32_t")
             self.calls.append(f"argmax({x}, {y}, {len(node.sizes)}, {sizes});")
-        elif isinstance(node, (Affine, Clip)):
+        elif isinstance(node, PerUnit):
             places = int(np.prod(node.shape[1:]))
             self._elementwise(node, x, y, f"{node.shape[0]}, {places}", node.fields())
         elif isinstance(node, Normalize):
@@ -142,11 +141,13 @@ class _Writer:
             self._table(name, field, "float") if field.ndim else _number(field)
             for name, field in fields.items()
         ]
-        if isinstance(node, (Clip, Normalize)):
-            self.functions["clipped"] = ckernels.CLIPPED
-        self.functions[node.name] = ckernels.elementwise(node.name)
-        name = ckernels.c_name(node.name)
-        self.calls.append(f"{name}({', '.join([x, y, size, *arguments])});")
+        kind = node.op if isinstance(node, PerUnit) else node.name
+        function = ckernels.elementwise(kind)
+        for name, helper in ckernels.HELPERS.items():
+            if f"{name}(" in function:
+                self.functions[name] = helper
+        self.functions[kind] = function
+        self.calls.append(f"{ckernels.c_name(kind)}({', '.join([x, y, size, *arguments])});")
 
     def _linear(self, layer: Linear, x: str, y: str) -> None:
         rows, scales = self._rows(layer)

@@ -104,19 +104,45 @@ ELEMENTWISE = {
     "tanh": ("", "tanhf(x[i])"),
     "sigmoid": ("", "0.5f * tanhf(0.5f * x[i]) + 0.5f"),
     "silu": ("", "x[i] * (0.5f * tanhf(0.5f * x[i]) + 0.5f)"),
+    "gelu": ("", "0.5f * x[i] * (1.0f + erff(0.70710678f * x[i]))"),
+    "gelu_tanh": (
+        "",
+        "0.5f * x[i] *\n               "
+        "(1.0f + tanhf(0.79788456f * (x[i] + 0.044715f * x[i] * x[i] * x[i])))",
+    ),
+    "mish": ("", "x[i] * tanhf(log1p_exp(x[i]))"),
+    "softplus": (", float threshold", "x[i] > threshold ? x[i] : log1p_exp(x[i])"),
+    "softsign": ("", "x[i] / (1.0f + fabsf(x[i]))"),
+    "hardswish": ("", "x[i] * (clipped(x[i] + 3.0f, 0.0f, 6.0f) / 6.0f)"),
+    "tanhshrink": ("", "x[i] - tanhf(x[i])"),
+    "softshrink": (", float most", "x[i] - clipped(x[i], -most, most)"),
+    "hardshrink": (", float most", "fabsf(x[i]) <= most ? 0.0f : x[i]"),
+    "threshold": (", float most, float instead", "x[i] <= most ? instead : x[i]"),
     "add": (", const float *z", "x[i] + z[i]"),
     "positive": ("", "x[i] > 0.0f ? 1.0f : 0.0f"),
 }
 PER_UNIT = {
     "affine": (", const float *scale, const float *shift", "*x * scale[i] + shift[i]"),
     "clip": (", const float *low, const float *high", "clipped(*x, low[i], high[i])"),
+    "slopes": (", const float *slope", "*x < 0.0f ? slope[i] * *x : *x"),
 }
-CLIPPED = """\
+HELPERS = {
+    "clipped": """\
 static float clipped(float x, float low, float high)
 {
     return x < low ? low : x > high ? high : x;
 }
-"""
+""",
+    "log1p_exp": """\
+static float log1p_exp(float x)
+{
+    return (x > 0.0f ? x : 0.0f) + log1pf(expf(-fabsf(x)));
+}
+""",
+}
+"""What expressions may call."""
+MATH = ("tanhf", "expm1f", "expf", "erff", "fabsf", "log1pf")
+"""What needs ``math.h``."""
 BORDERED = """\
 static void bordered(const float *x, float *y, uint32_t units, uint32_t height, uint32_t width,
                      uint32_t above, uint32_t left, float border)

@@ -37,7 +37,7 @@ def graph_of(model: BaseAlgorithm, normalization: VecNormalize | None) -> Graph:
     policy: Any = model.policy
     policy.set_training_mode(False)
     space = check_observations(model.observation_space)
-    tracer = Tracer(space.shape)
+    tracer = Tracer(space.shape, {id(module): name for name, module in policy.named_modules()})
     value = 0
     if normalization is not None:
         value = _normalize(tracer, normalization)

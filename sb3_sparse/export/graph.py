@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
@@ -11,7 +12,6 @@ from numpy.typing import NDArray
 from sb3_sparse.export.numpy_policy import OPERATIONS
 
 Floats = NDArray[np.float32]
-ACTIVATIONS = ("relu", "leaky_relu", "elu", "tanh", "sigmoid", "silu")
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,41 +67,59 @@ class Normalize(Node):
 
 
 @dataclass(frozen=True, eq=False)
-class Affine(Node):
-    """``x * scale + shift``, both of shape ``(units,)``."""
+class PerUnit(Node):
+    """Does with each unit what its own numbers say: all fields have shape ``(units,)``."""
+
+    names: ClassVar[tuple[str, ...]]
+
+    def fields(self) -> dict[str, NDArray[Any]]:
+        per_unit = (self.shape[0], *[1] * len(self.shape))
+        return {name: getattr(self, name).reshape(per_unit) for name in self.names}
+
+
+@dataclass(frozen=True, eq=False)
+class Affine(PerUnit):
+    """``x * scale + shift``."""
 
     scale: Floats
     shift: Floats
     op = "affine"
-
-    def fields(self) -> dict[str, NDArray[Any]]:
-        per_unit = (len(self.scale), *[1] * len(self.shape))
-        return {"scale": self.scale.reshape(per_unit), "shift": self.shift.reshape(per_unit)}
+    names = ("scale", "shift")
 
 
 @dataclass(frozen=True, eq=False)
-class Clip(Node):
-    """Between ``low`` and ``high``, both of shape ``(units,)``."""
+class Clip(PerUnit):
+    """Between ``low`` and ``high``."""
 
     low: Floats
     high: Floats
     op = "clip"
+    names = ("low", "high")
 
-    def fields(self) -> dict[str, NDArray[Any]]:
-        per_unit = (len(self.low), *[1] * len(self.shape))
-        return {"low": self.low.reshape(per_unit), "high": self.high.reshape(per_unit)}
+
+@dataclass(frozen=True, eq=False)
+class Slopes(PerUnit):
+    """``x * slope`` where ``x`` is negative, as the PReLU with a slope for each unit."""
+
+    slope: Floats
+    op = "slopes"
+    names = ("slope",)
+
+    @property
+    def name(self) -> str:
+        return "leaky_relu"
 
 
 @dataclass(frozen=True, eq=False)
 class Activation(Node):
-    """One of :data:`ACTIVATIONS`, element by element.
+    """A function of one number, element by element.
 
-    :param kind: which
-    :param slope: of the negative side (leaky ReLU), or its size (ELU)
+    :param kind: which, among the NumPy loader's
+    :param parameters: by name
     """
 
     kind: str
-    slope: float = 0.0
+    parameters: Mapping[str, float] = field(default_factory=dict)
     op = "activation"
 
     @property
@@ -109,9 +127,7 @@ class Activation(Node):
         return self.kind
 
     def fields(self) -> dict[str, NDArray[Any]]:
-        if self.kind not in ("leaky_relu", "elu"):
-            return {}
-        return {"slope": np.array(self.slope, np.float32)}
+        return {name: np.array(value, np.float32) for name, value in self.parameters.items()}
 
 
 @dataclass(frozen=True, eq=False)

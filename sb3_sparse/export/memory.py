@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sb3_sparse.export.graph import Activation, Affine, Clip, Conv, Flatten, Graph, MaxPool, Node
+from sb3_sparse.export.graph import Activation, Conv, Flatten, Graph, MaxPool, Node, PerUnit
 
-IN_PLACE = (Activation, Affine, Clip)
+IN_PLACE = (Activation, PerUnit)
 """Nodes that may write over their input."""
 
 

@@ -1,5 +1,7 @@
 """Policy("policy.npz")(observation) is the action; needs NumPy, uses SciPy if it is there."""
 
+import math
+
 import numpy as np
 
 try:
@@ -18,6 +20,11 @@ def windows(n, x, border):  # units, kernel, places, batch
     return x[:, :: n["stride"][0], :: n["stride"][1]].transpose(0, 4, 5, 1, 2, 3)
 
 
+def softplus(x):  # log(1 + exp(x)), which does not overflow
+    return np.maximum(x, 0) + np.log1p(np.exp(-np.abs(x)))
+
+
+erf = np.vectorize(math.erf, otypes=[np.float32])  # NumPy has none
 OPERATIONS = {  # of a node's arrays and its inputs, whose last axis is the batch
     "normalize": lambda n, x: np.clip((x - n["mean"] - n["rest"]) * n["scale"], *n["clip"]),
     "affine": lambda n, x: x * n["scale"] + n["shift"],
@@ -28,6 +35,18 @@ OPERATIONS = {  # of a node's arrays and its inputs, whose last axis is the batc
     "tanh": lambda n, x: np.tanh(x),
     "sigmoid": lambda n, x: 0.5 * np.tanh(0.5 * x) + 0.5,
     "silu": lambda n, x: x * (0.5 * np.tanh(0.5 * x) + 0.5),
+    "gelu": lambda n, x: 0.5 * x * (1 + erf(x * 0.5**0.5)),
+    "gelu_tanh": lambda n, x: (
+        0.5 * x * (1 + np.tanh((2 / np.pi) ** 0.5 * (x + 0.044715 * np.clip(x, -10, 10) ** 3)))
+    ),
+    "mish": lambda n, x: x * np.tanh(softplus(x)),
+    "softplus": lambda n, x: np.where(x > n["threshold"], x, softplus(x)),
+    "softsign": lambda n, x: x / (1 + np.abs(x)),
+    "hardswish": lambda n, x: x * (np.clip(x + 3, 0, 6) / 6),
+    "tanhshrink": lambda n, x: x - np.tanh(x),
+    "softshrink": lambda n, x: x - np.clip(x, -n["most"], n["most"]),
+    "hardshrink": lambda n, x: np.where(np.abs(x) <= n["most"], 0, x),
+    "threshold": lambda n, x: np.where(x <= n["most"], n["instead"], x),
     "linear": lambda n, x: n["weight"] @ x + n["bias"],
     "conv": lambda n, x: (
         n["weight"] @ (w := windows(n, x, 0)).reshape(-1, np.prod(w.shape[3:])) + n["bias"]

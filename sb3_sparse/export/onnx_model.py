@@ -21,7 +21,9 @@ from sb3_sparse.export.graph import (
     MaxPool,
     Node,
     Normalize,
+    Slopes,
 )
+from sb3_sparse.export.onnx_activations import write_activation
 
 try:
     from onnx import TensorProto, checker, helper, numpy_helper
@@ -30,13 +32,6 @@ except ImportError as error:
 
 OPSET = 17
 IR_VERSION = 8
-ACTIVATIONS = {
-    "relu": "Relu",
-    "leaky_relu": "LeakyRelu",
-    "elu": "Elu",
-    "tanh": "Tanh",
-    "sigmoid": "Sigmoid",
-}
 
 
 def write_onnx(graph: Graph, version: str) -> bytes:
@@ -116,12 +111,11 @@ class _Writer:
                 strides=node.stride,
                 pads=[*node.padding, *node.padding],
             )
-        elif isinstance(node, Activation) and node.kind == "silu":
-            gate = self.node("Sigmoid", inputs, f"{output}_gate")
-            self.node("Mul", [*inputs, gate], output)
         elif isinstance(node, Activation):
-            slope = {"alpha": node.slope} if node.fields() else {}
-            self.node(ACTIVATIONS[node.kind], inputs, output, **slope)
+            write_activation(self, node, inputs[0], output)
+        elif isinstance(node, Slopes):
+            slope = self.array(_batch_first(node.fields()["slope"])[0])
+            self.node("PRelu", [*inputs, slope], output)
         elif isinstance(node, Normalize):
             fields = {name: _batch_first(field) for name, field in node.fields().items()}
             centred = self.node("Sub", [*inputs, self.array(fields["mean"])], f"{output}_centred")

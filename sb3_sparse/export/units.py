@@ -13,8 +13,6 @@ from sb3_sparse.export.fold import with_weights
 from sb3_sparse.export.graph import (
     Activation,
     Add,
-    Affine,
-    Clip,
     Conv,
     Flatten,
     Graph,
@@ -22,10 +20,11 @@ from sb3_sparse.export.graph import (
     MaxPool,
     Node,
     Normalize,
+    PerUnit,
     Weighted,
 )
 
-UNIT_BY_UNIT = (Activation, Affine, Clip, Flatten, MaxPool, Normalize)
+UNIT_BY_UNIT = (Activation, PerUnit, Flatten, MaxPool, Normalize)
 """Nodes whose result has the units of their input."""
 
 
@@ -82,8 +81,8 @@ def select_units(graph: Graph, chosen: Mapping[int, NDArray[np.intp]]) -> Graph:
         elif isinstance(node, UNIT_BY_UNIT):
             units.append(before)
             fields: dict[str, Any] = {}
-            if isinstance(node, (Affine, Clip)):
-                fields = {name: getattr(node, name)[before] for name in node.fields()}
+            if isinstance(node, PerUnit):
+                fields = {name: getattr(node, name)[before] for name in node.names}
             node = replace(node, shape=(len(before), *node.shape[1:]), **fields)
         else:
             units.append(np.arange(node.shape[0]))
@@ -124,9 +123,9 @@ class _Constants:
                 self.known[value] = np.repeat(known, units[value] // len(known))
             elif isinstance(node, MaxPool):
                 self.known[value] = self.known[node.inputs[0]]
-            elif isinstance(node, (Activation, Affine, Clip)) and len(node.shape) == 1:
+            elif isinstance(node, (Activation, PerUnit)) and len(node.shape) == 1:
                 self.known[value] = node.run(self.known[node.inputs[0]][:, None])[:, 0]
-            elif isinstance(node, (Activation, Affine, Clip)):
+            elif isinstance(node, (Activation, PerUnit)):
                 known = self.known[node.inputs[0]]
                 self.known[value] = node.run(known[:, None, None, None])[:, 0, 0, 0]
         outputs = graph.nodes[-1].inputs if graph.discrete else (len(graph.nodes),)

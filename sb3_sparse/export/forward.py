@@ -1,0 +1,150 @@
+"""Through the ``forward`` of a user's own module, if it is simple enough."""
+
+from __future__ import annotations
+
+import operator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch as th
+from torch import fx, nn
+
+from sb3_sparse.export.activations import called, scaled
+from sb3_sparse.export.graph import Add
+
+if TYPE_CHECKING:
+    from sb3_sparse.export.trace import Tracer
+
+ADD = (operator.add, operator.iadd, th.add, "add", "add_")
+SUBTRACT = (operator.sub, operator.isub, th.sub, "sub", "sub_")
+MULTIPLY = (operator.mul, operator.imul, th.mul, "mul", "mul_")
+DIVIDE = (operator.truediv, operator.itruediv, th.div, "div", "div_")
+NEGATE = (operator.neg, th.neg, "neg")
+IN_PLACE = (operator.iadd, operator.isub, operator.imul, operator.itruediv)
+RESHAPE = ("view", "reshape", th.reshape)
+
+
+def trace_forward(tracer: Tracer, module: nn.Module, value: int) -> int:
+    """The result of a module applied to a value.
+
+    :raises UnsupportedError: if its ``forward`` does what cannot be exported
+    """
+    try:
+        graph = _Leaves().trace(module)
+    except Exception as error:  # whatever a forward does that cannot be traced
+        raise tracer.refusal(module, f"its forward cannot be traced ({error})") from error
+    values: dict[fx.Node, int] = {}
+    sizes: set[fx.Node] = set()
+    """What stands for the size of a batch, or for a shape, whose first number that is."""
+    for node in graph.nodes:
+        taken = [values.get(arg) for arg in node.all_input_nodes]
+        first = taken[0] if taken else None
+        found = None
+        if node.op == "placeholder" and not values:
+            found = value
+        elif node.op == "output" and node.args[0] in values:
+            return values[node.args[0]]
+        elif node.op == "call_module" and len(taken) == 1 and first is not None:
+            found = tracer.walk(module.get_submodule(str(node.target)), first)
+        elif _is_size(node, sizes):
+            sizes.add(node)
+            continue
+        elif node.op in ("call_function", "call_method") and first is not None:
+            found = _call(tracer, node, values, sizes)
+        if found is None:
+            raise tracer.refusal(module, f"its forward {_said(node)}")
+        values[node] = found
+    raise AssertionError("a graph has an output")
+
+
+class _Leaves(fx.Tracer):
+    """Traces one module's ``forward`` and nothing below."""
+
+    def is_leaf_module(self, m: nn.Module, module_qualified_name: str) -> bool:
+        return True
+
+
+def _call(
+    tracer: Tracer, node: fx.Node, values: dict[fx.Node, int], sizes: set[fx.Node]
+) -> int | None:
+    """The result of a function or method; None if it cannot be exported."""
+    target: Any = node.target
+    arguments = list(node.args)
+    options = dict(node.kwargs)
+    inputs = [values[arg] for arg in arguments if isinstance(arg, fx.Node) and arg in values]
+    in_place = options.pop("inplace", False) or target in IN_PLACE or str(target).endswith("_")
+    if in_place:
+        tracer.changed.update(tracer.sources(inputs[0]))
+    if target in RESHAPE:
+        flat = _flattens(tracer, inputs[0], arguments[1:], sizes) and not options
+        return tracer.walk(nn.Flatten(), inputs[0]) if flat else None
+    if len(inputs) == 2 and len(arguments) == 2 and target in ADD and not options:
+        shape = tracer.shape_of(inputs[0])
+        same = shape == tracer.shape_of(inputs[1])
+        return tracer.add(Add((inputs[0], inputs[1]), shape)) if same else None
+    if len(inputs) != 1 or len(node.all_input_nodes) != 1:
+        return None
+    (value,) = inputs
+    factor_and_shift = None if options else _arithmetic(target, arguments)
+    if factor_and_shift is not None:
+        for make in scaled(*factor_and_shift):
+            value = tracer.add(make(value, tracer.shape_of(value)))
+        return value
+    made = called(target, arguments[1:], options)
+    return None if made is None else tracer.walk(made, value)
+
+
+def _arithmetic(target: Any, arguments: list[Any]) -> tuple[float, float] | None:
+    """What a value is multiplied by, and what is added; None if it is no such operation."""
+    if target in NEGATE:
+        return -1.0, 0.0
+    if len(arguments) != 2:
+        return None
+    first = isinstance(arguments[0], fx.Node)
+    number = arguments[1 if first else 0]
+    if isinstance(number, bool) or not isinstance(number, (int, float)):
+        return None
+    if target in ADD:
+        return 1.0, float(number)
+    if target in MULTIPLY:
+        return float(number), 0.0
+    if target in SUBTRACT:
+        return (1.0, -float(number)) if first else (-1.0, float(number))
+    if target in DIVIDE and first and number:
+        return 1.0 / number, 0.0
+    return None
+
+
+def _is_size(node: fx.Node, sizes: set[fx.Node]) -> bool:
+    """Whether a node leads to the batch's size, as in ``x.view(x.size(0), -1)``."""
+    if node.target == "size" or (node.target is getattr and node.args[1] == "shape"):
+        return node.args[1:] in ((), (0,), ("shape",))
+    of_a_shape = node.target is operator.getitem and node.args[0] in sizes
+    return of_a_shape and node.args[1:] == (0,)
+
+
+def _flattens(tracer: Tracer, value: int, wanted: list[Any], sizes: set[fx.Node]) -> bool:
+    """Whether a new shape is that of the batch with all units in one row."""
+    shape = list(wanted[0]) if len(wanted) == 1 and isinstance(wanted[0], tuple) else wanted
+    if len(shape) != 2:
+        return False
+    units = int(np.prod(tracer.shape_of(value)))
+    kept = isinstance(shape[0], fx.Node) and shape[0] in sizes
+    return bool((kept and shape[1] in (-1, units)) or shape == [-1, units])
+
+
+def _said(node: fx.Node) -> str:
+    """What a node does, in words."""
+    if node.op == "placeholder":
+        return f"takes {node.target} too"
+    if node.op == "output":
+        return "gives something else than one tensor"
+    if node.op == "get_attr":
+        return f"reads {node.target}"
+    if node.op == "call_module":
+        return f"calls {node.target} with something else than one tensor"
+    target: Any = node.target
+    name = target if isinstance(target, str) else getattr(target, "__name__", str(target))
+    given = [repr(arg) for arg in node.args if not isinstance(arg, (fx.Node, tuple, list))]
+    given += [f"{name}={value!r}" for name, value in node.kwargs.items()]
+    return f"calls {name}({', '.join(given)})"
