@@ -2,6 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from difflib import get_close_matches
+
+
+def did_you_mean(name: object, known: Iterable[str]) -> str:
+    """What to add to a message on an unknown name: the nearest known one, or nothing.
+
+    :param name: what was given, of any type
+    :param known: what is allowed
+    """
+    by_spelling = {one.lower(): one for one in known}
+    close = get_close_matches(str(name).lower(), by_spelling, n=1)
+    return f" (did you mean {by_spelling[close[0]]!r}?)" if close else ""
+
 
 class SparsityError(Exception):
     """Base of every error that this package raises on purpose."""
@@ -13,6 +27,10 @@ class ConfigError(SparsityError, ValueError):
 
 class UnsupportedError(SparsityError, TypeError):
     """An algorithm, layer or space that sparse training does not cover."""
+
+
+class Diverged(SparsityError, ArithmeticError):
+    """A training whose networks hold values that are not finite."""
 
 
 class CorruptStateError(SparsityError, ValueError):

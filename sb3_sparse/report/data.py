@@ -22,7 +22,8 @@ from sb3_sparse.zoo.record import NAME, read_record
 from sb3_sparse.zoo.results import score_of
 
 Array = npt.NDArray[np.float64]
-FINISHED, COUNTED = "finished", "counted"
+FINISHED, COUNTED, DIVERGED = "finished", "counted", "diverged"
+NEAR = 0.01  # of the connections; what rounds and schedules differ by is far less
 MEASURED = {
     "snr.csv": ("timesteps", "name", "value"),
     "plasticity.csv": ("timesteps", "name", "value"),
@@ -195,6 +196,7 @@ def _read(folder: Path) -> tuple[RunData, list[str]]:
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{NAME} cannot be read: {error}") from error
     _check(record)
+    _check_reached(record)
     empty = np.zeros(0)
     timesteps, returns = empty, empty
     if record["status"] == FINISHED:
@@ -216,6 +218,8 @@ def _check(record: Any) -> None:
     status = record.get("status")
     if status == "failed":
         raise ConfigError(f"failed: {record.get('error') or 'no reason is recorded'}")
+    if status == DIVERGED:
+        raise ConfigError(f"diverged: {record.get('error') or 'no step is recorded'}")
     if status not in (FINISHED, COUNTED):
         raise ConfigError(f"not finished: its status is {status!r}")
     for name in ("run", "settings", "total", "layers", "method"):
@@ -226,6 +230,27 @@ def _check(record: Any) -> None:
         for name in names:
             if not isinstance(record[part], dict) or record[part].get(name) is None:
                 raise ConfigError(f"{NAME} is incomplete: {part}.{name} is missing")
+
+
+def _check_reached(record: Mapping[str, Any]) -> None:
+    """Refuse a run whose networks are not as sparse as its settings say.
+
+    Runs of before ``wanted_nnz`` was recorded can only have stayed too dense after a denser start.
+    """
+    total, kwargs = record["total"], record["settings"].get("policy_kwargs", {})
+    reached, asked = float(total["sparsity"]), kwargs.get("sparsity")
+    wanted = total.get("wanted_nnz")
+    if wanted is not None:
+        missed = abs(int(total["nnz"]) - int(wanted)) > NEAR * int(wanted)
+    else:
+        denser = kwargs.get("initial_sparsity") is not None and isinstance(asked, (int, float))
+        missed = denser and reached < asked - NEAR
+    if missed:
+        raise ConfigError(
+            f"its sparsity is {reached:.2%}, not the {asked} that its settings ask for: it was not "
+            "pruned, or not to the end; train it again with a callback that prunes, longer or with "
+            "a smaller update_interval"
+        )
 
 
 def _evaluations(path: Path) -> tuple[Array, Array]:

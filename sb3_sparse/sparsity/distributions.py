@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Sequence
 from numbers import Real
 
-from sb3_sparse.errors import ConfigError
+from sb3_sparse.errors import ConfigError, did_you_mean
 
 Shape = Sequence[int]
 
@@ -85,7 +85,8 @@ def check_distribution(distribution: str) -> str:
     """
     if not isinstance(distribution, str) or distribution not in DISTRIBUTIONS:
         raise ConfigError(
-            f"unknown distribution {distribution!r}; allowed are {', '.join(sorted(DISTRIBUTIONS))}"
+            f"unknown distribution {distribution!r}{did_you_mean(distribution, DISTRIBUTIONS)}; "
+            f"allowed are {', '.join(sorted(DISTRIBUTIONS))}"
         )
     return distribution
 

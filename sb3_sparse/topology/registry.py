@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TypeVar
 
-from sb3_sparse.errors import ConfigError
+from sb3_sparse.errors import ConfigError, did_you_mean
 from sb3_sparse.topology.base import TopologyMethod
 
 _METHODS: dict[str, TopologyMethod] = {}
@@ -45,7 +45,8 @@ def method_named(name: str) -> TopologyMethod:
     """
     if not isinstance(name, str) or name not in _METHODS:
         raise ConfigError(
-            f"unknown method {name!r}; allowed are {', '.join(method_names())}. A method of your "
+            f"unknown method {name!r}{did_you_mean(name, _METHODS)}; allowed are "
+            f"{', '.join(method_names())}. A method of your "
             "own is a subclass of sb3_sparse.topology.TopologyMethod with @register on it"
         )
     return _METHODS[name]

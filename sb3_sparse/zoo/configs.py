@@ -7,12 +7,8 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from sb3_sparse.errors import ConfigError, MissingExtra
-
-try:
-    import yaml
-except ImportError as error:
-    raise MissingExtra("reading configs", "zoo") from error
+from sb3_sparse.errors import ConfigError, did_you_mean
+from sb3_sparse.zoo.strictyaml import parse
 
 PACKAGE = Path(__file__).parent.parent
 ROOTS = (PACKAGE / "zoo_hparams", PACKAGE.parent / "zoo_hparams")  # in a wheel; in a clone
@@ -33,15 +29,17 @@ def config_path(method: str, algo: str) -> Path:
     """
     if method not in METHODS:
         raise ConfigError(
-            f"no config is shipped for method {method!r}, only for {', '.join(METHODS)}; write "
-            "one and give it as --conf-file (docs/configs.md)"
+            f"no config is shipped for method {method!r}, only for {', '.join(METHODS)}"
+            f"{did_you_mean(method, METHODS)}. Or write one and give it as --conf-file "
+            "(docs/configs.md)"
         )
     path = config_root() / method / f"{algo}.yml"
     if not path.is_file():
-        names = ", ".join(sorted(file.stem for file in path.parent.glob("*.yml")))
+        names = sorted(file.stem for file in path.parent.glob("*.yml"))
         raise ConfigError(
-            f"no config is shipped for {algo!r}, only for {names}; write one and give it as "
-            "--conf-file (docs/configs.md)"
+            f"no config is shipped for {algo!r}, only for {', '.join(names)}"
+            f"{did_you_mean(algo, names)}. Or write one and give it as --conf-file "
+            "(docs/configs.md)"
         )
     return path
 
@@ -50,7 +48,8 @@ def read_yaml(path: Path, what: str = "environment ids to settings") -> dict[str
     """The mapping in a YAML file.
 
     :param what: it maps, for the message
-    :raises ConfigError: if there is no such file, or no mapping in it
+    :raises ConfigError: if there is no such file, it cannot be read, holds no mapping, or one in
+        which a key stands twice
     """
     return deepcopy(_read(path, what))
 
@@ -59,8 +58,12 @@ def _read(path: Path, what: str = "environment ids to settings") -> dict[str, An
     if not path.is_file():
         raise ConfigError(f"there is no config file {path}")
     try:
-        content = _parsed(path.read_text())
-    except yaml.YAMLError as error:
+        content = _parsed(path.read_text(encoding="utf-8"))
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path} is no text in UTF-8 ({error}); save it as UTF-8") from error
+    except OSError as error:
+        raise ConfigError(f"{path} cannot be read: {error.strerror}") from error
+    except ConfigError as error:
         raise ConfigError(f"{path} is no valid YAML: {error}") from error
     if not isinstance(content, dict):
         raise ConfigError(f"{path} must map {what}, got {content!r}")
@@ -70,7 +73,7 @@ def _read(path: Path, what: str = "environment ids to settings") -> dict[str, An
 @lru_cache(maxsize=64)
 def _parsed(text: str) -> Any:
     """What a text says; once, since a study asks for the same files thousands of times."""
-    return yaml.safe_load(text)
+    return parse(text)
 
 
 def entry_of(path: Path, env_id: str, atari: bool) -> dict[str, Any]:
@@ -87,8 +90,9 @@ def entry_of(path: Path, env_id: str, atari: bool) -> dict[str, Any]:
     if key not in content:
         others = "Atari game" if atari else "environment"
         raise ConfigError(
-            f"{path} has no settings for {env_id!r}; its keys are {', '.join(map(str, content))}. "
-            f"Add the key {env_id!r}, or `{shared}` for every {others} without a key of its own"
+            f"{path} has no settings for {env_id!r}; its keys are {', '.join(map(str, content))}"
+            f"{did_you_mean(env_id, map(str, content))}. Add the key {env_id!r}, or `{shared}` for "
+            f"every {others} without a key of its own"
         )
     entry = content[key]
     if not isinstance(entry, dict):

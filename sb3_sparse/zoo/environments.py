@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import importlib.util
-from difflib import get_close_matches
 
 import gymnasium as gym
 
-from sb3_sparse.errors import ConfigError, MissingExtra
+from sb3_sparse.errors import ConfigError, MissingExtra, did_you_mean
 
 
 def register_atari() -> bool:
@@ -31,10 +30,9 @@ def known_environment(env_id: str) -> None:
     if looks_atari and not (has_atari and importlib.util.find_spec("cv2")):
         raise MissingExtra(env_id, "atari")
     if env_id not in gym.registry:
-        close = get_close_matches(env_id, gym.registry, n=1)
         raise ConfigError(
             f"unknown environment {env_id!r}"
-            + (f"; did you mean {close[0]!r}?" if close else "; give a Gymnasium id")
+            + (did_you_mean(env_id, gym.registry) or "; give a Gymnasium id")
             + ("" if has_atari else " (Atari games need sb3-sparse[atari])")
         )
 

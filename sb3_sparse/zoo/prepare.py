@@ -76,12 +76,18 @@ def prepare(run: Run, log_folder: Path) -> Prepared:
 def count(run: Run, folder: Path) -> None:
     """Record what a run's networks would hold and cost, in a folder of its own; no training.
 
+    Networks that would be pruned are counted as they end, not as they begin.
+
     :param folder: as of :func:`sb3_sparse.zoo.train.train`
     :raises ConfigError: as :func:`prepare`
     """
     prepared = prepare(run, folder.parent.parent)
+    kwargs = {**prepared.settings["policy_kwargs"], "initial_sparsity": None}
     policy = untrained_policy(
-        run.algorithm, prepared.observation_space, prepared.action_space, prepared.settings
+        run.algorithm,
+        prepared.observation_space,
+        prepared.action_space,
+        {**prepared.settings, "policy_kwargs": kwargs},
     )
     folder.mkdir(parents=True, exist_ok=True)
     write_record(folder, status="counted", **prepared.record(run), **sparsity_of(policy))

@@ -73,13 +73,17 @@ def versions() -> dict[str, str]:
 
 
 def sparsity_of(policy: SparsePolicyMixin) -> dict[str, Any]:
-    """Counts of a policy as it is now: in total, by network and layer by layer."""
+    """Counts of a policy as it is now: in total, by network and layer by layer.
+
+    ``wanted_nnz`` are the active connections that its settings ask for.
+    """
     report = policy.sparsity_report()
     networks = dict.fromkeys(layer.network for layer in report.layers)
     return {
         "total": {
             "sparsity": report.sparsity(),
             "nnz": report.nnz,
+            "wanted_nnz": report.nnz + sum(one.final_nnz - one.nnz for one in policy.sparse.layers),
             "parameters": report.parameters,
             "flops": sum(layer.flops for layer in report.layers),
             "dense_flops": sum(layer.dense_flops for layer in report.layers),

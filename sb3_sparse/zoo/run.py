@@ -4,23 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from copy import deepcopy
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from sb3_sparse.errors import ConfigError
+from sb3_sparse.errors import ConfigError, did_you_mean
 from sb3_sparse.policies.aliases import supported_algorithms
 from sb3_sparse.sparsity.distributions import check_distribution, check_sparsity
+from sb3_sparse.zoo.arguments import is_whole
 from sb3_sparse.zoo.configs import config_path, entry_of, evaluation_of
 from sb3_sparse.zoo.environments import is_atari, known_environment
-from sb3_sparse.zoo.settings import (
-    apply_overrides,
-    check_values,
-    method_of,
-    policy_kwargs_of,
-)
+from sb3_sparse.zoo.settings import apply_overrides, method_of, policy_kwargs_of
+from sb3_sparse.zoo.validation import check_settings
 
 DENSE = "dense"
 
@@ -66,10 +64,14 @@ class Run:
     entry: Mapping[str, Any] | None = None
 
     def __post_init__(self) -> None:
+        for one in fields(self):  # NumPy's numbers, which no JSON takes, become Python's
+            object.__setattr__(self, one.name, plain(getattr(self, one.name)))
+        self._check_types()
         if self.algo not in algorithms():
             raise ConfigError(
-                f"unknown algorithm {self.algo!r}; allowed are {', '.join(algorithms())} (tqc, "
-                "qrdqn, crossq and trpo need sb3-sparse[contrib])"
+                f"unknown algorithm {self.algo!r}{did_you_mean(self.algo, algorithms())}; allowed "
+                f"are {', '.join(algorithms())} (tqc, qrdqn, crossq and trpo need "
+                "sb3-sparse[contrib])"
             )
         known_environment(self.env_id)
         if self.sparsity is not None:
@@ -78,14 +80,29 @@ class Run:
             check_distribution(self.distribution)
         for name in ("n_timesteps", "n_envs", "eval_freq", "eval_episodes"):
             value = getattr(self, name)
-            if value is not None and type(value) is not int:
-                raise ConfigError(f"{name} must be a whole number, e.g. 100000, got {value!r}")
             if value is not None and value < 1:
                 raise ConfigError(f"{name} must be 1 or more, got {value}")
         if not 0 <= self.seed < 2**31:
             raise ConfigError(f"the seed must lie in [0, 2^31), got {self.seed}")
         if self.match_params is not None:
             check_sparsity(self.match_params, "match_params")
+
+    def _check_types(self) -> None:
+        for names, what, fits in (
+            (("algo", "env_id", "device"), "a text", lambda v: isinstance(v, str)),
+            (("method", "conf_file"), "a text", lambda v: v is None or isinstance(v, str)),
+            (("hyperparams",), "a mapping", lambda v: isinstance(v, Mapping)),
+            (("entry",), "a mapping", lambda v: v is None or isinstance(v, Mapping)),
+            (("seed",), "a whole number, e.g. 3", is_whole),
+            (
+                ("n_timesteps", "n_envs", "eval_freq", "eval_episodes"),
+                "a whole number, e.g. 100000",
+                lambda v: v is None or is_whole(v),
+            ),
+        ):
+            for name in names:
+                if not fits(getattr(self, name)):
+                    raise ConfigError(f"{name} must be {what}, got {getattr(self, name)!r}")
 
     @property
     def algorithm(self) -> type[BaseAlgorithm]:
@@ -137,7 +154,7 @@ class Run:
             if getattr(self, name) is not None
         }
         apply_overrides(settings, {**self.hyperparams, **wanted}, self.algorithm)
-        check_values(settings)
+        check_settings(settings, self.algorithm)
         if method_of(settings) != method:
             raise ConfigError(
                 f"what is changed makes this {method_of(settings)!r} training, not {method!r}; "
@@ -148,10 +165,7 @@ class Run:
                 f"the settings of {self.env_id} in {self.config} lack n_timesteps; add it there or "
                 "give -n"
             )
-        steps = settings["n_timesteps"]
-        if isinstance(steps, bool) or not isinstance(steps, (int, float)) or steps < 1:
-            raise ConfigError(f"n_timesteps must be a number, 1 or more, got {steps!r}")
-        settings["n_timesteps"] = int(steps)
+        settings["n_timesteps"] = int(settings["n_timesteps"])
         return settings
 
     def evaluation(self) -> dict[str, int]:
@@ -163,6 +177,17 @@ class Run:
     def as_dict(self) -> dict[str, Any]:
         """Plain values, from which ``Run(**values)`` makes the same run."""
         return {**asdict(self), "hyperparams": dict(self.hyperparams)}
+
+
+def plain(value: Any) -> Any:
+    """A value with Python's numbers and lists in place of NumPy's, in mappings and lists too."""
+    if isinstance(value, (np.generic, np.ndarray)):
+        return plain(value.tolist())
+    if isinstance(value, Mapping):
+        return {key: plain(one) for key, one in value.items()}
+    if type(value) in (list, tuple):
+        return type(value)(map(plain, value))
+    return value
 
 
 def _is_path(text: str) -> bool:

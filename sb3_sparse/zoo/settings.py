@@ -5,16 +5,15 @@ from __future__ import annotations
 import ast
 import inspect
 from collections.abc import Iterable, Mapping
-from difflib import get_close_matches
+from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_sparse.callback import SparsityCallback
-from sb3_sparse.errors import ConfigError
+from sb3_sparse.errors import ConfigError, did_you_mean
 from sb3_sparse.policies.aliases import SparsePolicy
-from sb3_sparse.policies.config import SPARSITY_MISSING
 from sb3_sparse.policies.named import import_path
 from sb3_sparse.topology import method_named
 
@@ -29,7 +28,6 @@ ZOO_KEYS = frozenset(
 
 # Arguments of every algorithm that a run sets itself, by options of their own.
 SET_BY_THE_ENGINE = frozenset({"device", "seed", "tensorboard_log", "verbose"})
-SCHEDULES = ("learning_rate", "clip_range", "clip_range_vf")
 
 
 def parse_overrides(texts: Iterable[str]) -> dict[str, Any]:
@@ -69,6 +67,29 @@ def _value(text: str) -> Any:
         return text
 
 
+@dataclass(frozen=True)
+class Names:
+    """The arguments that settings may hold, by whose they are. They do not overlap.
+
+    :param algorithm: of the algorithm's constructor and of rl-zoo
+    :param policy: of the sparse policy
+    :param schedule: of the SparsityCallback, but for its method
+    """
+
+    algorithm: frozenset[str]
+    policy: frozenset[str]
+    schedule: frozenset[str]
+
+    @classmethod
+    def of(cls, algorithm: type[BaseAlgorithm]) -> Names:
+        """Those that go with an algorithm."""
+        return cls(
+            (_arguments(algorithm) - SET_BY_THE_ENGINE) | ZOO_KEYS,
+            _arguments(algorithm.policy_aliases[SparsePolicy]),
+            _arguments(SparsityCallback) - {"method", "verbose"},
+        )
+
+
 def apply_overrides(
     settings: dict[str, Any], overrides: Mapping[str, Any], algorithm: type[BaseAlgorithm]
 ) -> None:
@@ -79,26 +100,23 @@ def apply_overrides(
 
     :raises ConfigError: for a name that none of them has
     """
-    of_callback = _arguments(SparsityCallback) - {"method", "verbose"}
-    of_policy = _arguments(algorithm.policy_aliases[SparsePolicy]) - {"kwargs"}
-    of_algorithm = (_arguments(algorithm) - SET_BY_THE_ENGINE) | ZOO_KEYS
+    names = Names.of(algorithm)
     for name, value in overrides.items():
-        if name in of_algorithm:
+        if name in names.algorithm:
             known = settings.get(name)
             both = isinstance(known, Mapping) and isinstance(value, Mapping)
             settings[name] = {**known, **value} if both and known else value
-        elif name in of_policy:
+        elif name in names.policy:
             settings["policy_kwargs"] = {**policy_kwargs_of(settings), name: value}
-        elif name in of_callback:
+        elif name in names.schedule:
             sparsity_callback(settings, name)[name] = value
         else:
-            known_names = of_algorithm | of_policy | of_callback
-            close = get_close_matches(name, known_names, n=1)
+            known_names = names.algorithm | names.policy | names.schedule
             raise ConfigError(
                 f"{algorithm.__name__} has no hyperparameter {name!r}"
-                + (f"; did you mean {close[0]!r}?" if close else "")
-                + f" Of the algorithm: {_listed(of_algorithm)}. Of the policy: "
-                f"{_listed(of_policy)}. Of the mask's schedule: {_listed(of_callback)}"
+                f"{did_you_mean(name, known_names)}. Of the algorithm: "
+                f"{_listed(names.algorithm)}. Of the policy: {_listed(names.policy)}. Of the "
+                f"mask's schedule: {_listed(names.schedule)}"
             )
 
 
@@ -108,15 +126,20 @@ def _listed(names: Iterable[str]) -> str:
 
 @cache
 def _arguments(cls: type) -> frozenset[str]:
-    """Names that a class and its bases take when made, but those that every SB3 class is given."""
+    """Names that a class takes when made, but those that every SB3 class is given.
+
+    What a constructor does not name itself but takes as ``**kwargs`` is its base class's.
+    """
     names: set[str] = set()
     for base in cls.__mro__:
-        if "__init__" in vars(base) and base.__module__.split(".")[0] != "torch":
-            names.update(inspect.signature(vars(base)["__init__"]).parameters)
-    given = (
-        "self args kwargs env observation_space action_space lr_schedule supported_action_spaces"
-    )
-    return frozenset(names - {*given.split(), "_init_setup_model", "support_multi_env"})
+        if "__init__" not in vars(base):
+            continue
+        parameters = inspect.signature(vars(base)["__init__"]).parameters
+        names.update(parameters)
+        if not any(one.kind is one.VAR_KEYWORD for one in parameters.values()):
+            break
+    given = "self args kwargs env observation_space action_space lr_schedule _init_setup_model"
+    return frozenset(names - {*given.split()})
 
 
 def sparsity_callback(settings: Mapping[str, Any], wanted: str = "") -> dict[str, Any]:
@@ -133,6 +156,17 @@ def sparsity_callback(settings: Mapping[str, Any], wanted: str = "") -> dict[str
 
 def find_callback(settings: Mapping[str, Any]) -> dict[str, Any] | None:
     """The arguments of the SparsityCallback in the settings; None where there is none."""
+    found = _our_callback(settings)
+    return None if found is None else found[1]
+
+
+def has_own_callback(settings: Mapping[str, Any]) -> bool:
+    """Whether the callback is a subclass of the user's, which may take other arguments."""
+    found = _our_callback(settings)
+    return found is not None and found[0] is not SparsityCallback
+
+
+def _our_callback(settings: Mapping[str, Any]) -> tuple[type[Any], dict[str, Any]] | None:
     callbacks = settings.get("callback") or []
     for callback in callbacks if isinstance(callbacks, list) else [callbacks]:
         named = callback if isinstance(callback, dict) else {callback: {}}
@@ -141,51 +175,22 @@ def find_callback(settings: Mapping[str, Any]) -> dict[str, Any] | None:
                 f"a callback is one path, with its arguments indented below it, got {callback!r}"
             )
         ((path, arguments),) = named.items()
-        if _is_ours(path):
-            if "method" not in (arguments or {}):
+        found = _callback_class(path)
+        if found is not None:
+            if not isinstance(arguments, dict) or "method" not in arguments:
                 raise ConfigError(f"{path} needs a method, e.g. {path}: {{method: rigl}}")
-            found: dict[str, Any] = arguments
-            return found
+            return found, arguments
     return None
 
 
-def _is_ours(path: str) -> bool:
+def _callback_class(path: object) -> type[Any] | None:
+    if not isinstance(path, str):
+        raise ConfigError(f"a callback is a dotted path, e.g. {CALLBACK}, got {path!r}")
     try:
-        return import_path(path) is SparsityCallback
+        found = import_path(path)
     except ImportError:
-        return False  # rl-zoo says so when it imports it
-
-
-def check_values(settings: Mapping[str, Any]) -> None:
-    """Refuse what YAML has read as text but was meant as a number.
-
-    :raises ConfigError: if there is any
-    """
-    callback = find_callback(settings) or {}
-    for part in (settings, policy_kwargs_of(settings), callback):
-        for name, value in part.items():
-            if isinstance(value, str) and _is_number(value):
-                raise ConfigError(
-                    f"{name} is the text {value!r}, as YAML reads a number without a dot and a "
-                    f"sign; write {name}: !!float {value}"
-                )
-    for name in SCHEDULES:
-        value = settings.get(name)
-        if isinstance(value, str) and not _is_number(value.removeprefix("lin_")):
-            raise ConfigError(
-                f"{name} must be a number, or lin_ and a number for a linear decay to 0, e.g. "
-                f"lin_0.001, got {value!r}"
-            )
-    if "sparsity" not in policy_kwargs_of(settings):
-        raise ConfigError(SPARSITY_MISSING)
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
+        return None  # rl-zoo says so when it imports it
+    return found if isinstance(found, type) and issubclass(found, SparsityCallback) else None
 
 
 def method_of(settings: Mapping[str, Any]) -> str:
@@ -202,7 +207,8 @@ def method_of(settings: Mapping[str, Any]) -> str:
     if callback is not None:
         return method_named(callback["method"]).name
     sparsity = policy_kwargs_of(settings).get("sparsity")
-    return "dense" if sparsity == 0.0 else "static"
+    shares = list(sparsity.values()) if isinstance(sparsity, Mapping) else [sparsity]
+    return "dense" if all(share == 0.0 for share in shares) else "static"
 
 
 def policy_kwargs_of(settings: Mapping[str, Any]) -> dict[str, Any]:

@@ -166,6 +166,15 @@ def test_counted_cells_have_sizes_and_no_model(tmp_path):
     assert not list(made.cells[1].folder(tmp_path / "store").glob("*.zip"))
 
 
+def test_a_pruned_network_is_counted_as_it_ends(tmp_path):
+    pruned = {"method": "prune", "sparsity": 0.5, "distribution": "uniform"}
+    made = study(tmp_path, trained=False, runs=[pruned])
+    finish(made, tmp_path / "store")
+    record = read_record(made.cells[0].folder(tmp_path / "store"))
+    assert record["total"]["nnz"] == record["total"]["wanted_nnz"] == 24  # of 48
+    assert record["settings"]["policy_kwargs"]["initial_sparsity"] == 0.0
+
+
 def test_noise_is_measured_of_the_trained_model_without_training_it_again(trained, tmp_path):
     _, store = trained
     copy = tmp_path / "store"

@@ -33,6 +33,36 @@ def test_a_smaller_dense_network_has_a_label_of_its_own(folders):
     assert [(run.label, run.level) for run in runs] == [("dense", 0.0), ("dense-equal", 0.9)]
 
 
+def changed(folder, part, **values):
+    path = folder / "sparsity.json"
+    record = json.loads(path.read_text())
+    record[part] = {**record[part], **values}
+    path.write_text(json.dumps(record))
+
+
+@pytest.mark.parametrize("status", ["finished", "counted"])
+@pytest.mark.parametrize(
+    ("nnz", "wanted", "read"),
+    [(410, 410, True), (410, 408, True), (4096, 410, False), (500, 410, False), (300, 410, False)],
+)
+def test_a_run_that_is_not_as_sparse_as_it_was_to_be_is_named_and_not_averaged(
+    folders, status, nnz, wanted, read
+):
+    folder = folders.add("prune", 0.9, status=status)
+    changed(folder, "total", nnz=nnz, wanted_nnz=wanted, sparsity=1 - nnz / 4096)
+    runs, out = reasons([folder])
+    assert [bool(runs), bool(out)] == [read, not read]
+    if not read:
+        assert f"its sparsity is {1 - nnz / 4096:.2%}, not the 0.9" in out[folder]
+
+
+def test_an_older_record_of_a_run_that_stayed_dense_is_named_too(folders):
+    folder = folders.add("static", 0.9, policy={"initial_sparsity": 0.0})
+    assert not reasons([folder])[1]
+    changed(folder, "total", sparsity=0.0)
+    assert "its sparsity is 0.00%, not the 0.9" in reasons([folder])[1][folder]
+
+
 @pytest.mark.parametrize("status", ["running", "evaluating", "interrupted", "failed"])
 def test_an_unfinished_run_is_named(folders, status):
     folder = folders.add(status=status)

@@ -215,7 +215,7 @@ def test_an_environment_without_settings_says_which_file_which_keys_and_what_to_
         ),
         (
             "CartPole-v1: {n_timesteps: no, policy: SparsePolicy, policy_kwargs: {sparsity: 0.5}}",
-            "n_timesteps must be a number",
+            "n_timesteps must be a whole number",
         ),
         (
             "CartPole-v1: {policy: SparsePolicy, callback: sb3_sparse.SparsityCallback}",

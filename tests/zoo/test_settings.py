@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+
+import numpy as np
 import pytest
 from stable_baselines3 import DQN, PPO, SAC
 
@@ -149,7 +152,18 @@ def test_what_the_user_wants_wins_over_the_config():
         (dict(method="gmp"), "no config is shipped for method 'gmp'"),
         (dict(sparsity=1.0), r"sparsity must lie in \[0, 1\)"),
         (dict(distribution="erdos"), "distribution"),
+        (dict(algo="SAC"), r"unknown algorithm 'SAC' \(did you mean 'sac'\?\)"),
+        (dict(method="rigel"), r"did you mean 'rigl'\?"),
+        (dict(conf_file="dqn_impla"), r"did you mean 'dqn_impala'\?"),
+        (dict(sparsity=0.5, distribution="erkk"), r"did you mean 'erk'\?"),
         (dict(seed=-1), "seed must lie in"),
+        (dict(seed="3"), "seed must be a whole number, e.g. 3, got '3'"),
+        (dict(seed=True), "seed must be a whole number, e.g. 3, got True"),
+        (dict(algo=3), "algo must be a text, got 3"),
+        (dict(env_id=None), "env_id must be a text, got None"),
+        (dict(conf_file=3), "conf_file must be a text, got 3"),
+        (dict(hyperparams=[]), r"hyperparams must be a mapping, got \[\]"),
+        (dict(n_timesteps=1e4), "n_timesteps must be a whole number, e.g. 100000, got 10000.0"),
         (dict(n_timesteps=0), "n_timesteps must be 1 or more"),
         (dict(eval_freq=-5), "eval_freq must be 1 or more"),
         (dict(method="dense", sparsity=0.9), "--match-params 0.9"),
@@ -213,3 +227,21 @@ def test_a_run_survives_being_written_down():
     run = Run(algo="ppo", env_id="Ant-v4", hyperparams={"gamma": 0.9}, eval_episodes=3)
     assert Run(**run.as_dict()) == run
     assert run.evaluation() == {"eval_freq": 2000, "eval_episodes": 3}
+
+
+def test_numpys_numbers_are_pythons_in_the_settings_and_on_record():
+    given = dict(
+        seed=np.int64(3),
+        n_timesteps=np.int32(100),
+        sparsity=np.float32(0.5),
+        hyperparams={"gamma": np.float64(0.9), "net_arch": [np.int64(8)], "batch_size": np.int8(4)},
+    )
+    run = Run(**given)
+    assert run == Run(
+        seed=3,
+        n_timesteps=100,
+        sparsity=0.5,
+        hyperparams={"gamma": 0.9, "net_arch": [8], "batch_size": 4},
+    )
+    assert Run(**json.loads(json.dumps(run.as_dict()))) == run
+    assert json.loads(json.dumps(run.settings())) == run.settings()

@@ -1,0 +1,113 @@
+"""Settings of a run, checked before anything is trained."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Set
+from dataclasses import fields
+from typing import Any
+
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from sb3_sparse.callback import SparsityCallback
+from sb3_sparse.engine.optimizers import check_weight_decay
+from sb3_sparse.errors import ConfigError, did_you_mean
+from sb3_sparse.policies.config import SPARSITY_MISSING, SparsityConfig
+from sb3_sparse.policies.named import import_named
+from sb3_sparse.topology import method_named
+from sb3_sparse.zoo.arguments import kind_of
+from sb3_sparse.zoo.settings import (
+    CALLBACK,
+    SET_BY_THE_ENGINE,
+    Names,
+    find_callback,
+    has_own_callback,
+    policy_kwargs_of,
+)
+
+OF_SPARSITY = frozenset(one.name for one in fields(SparsityConfig))
+
+
+def check_settings(settings: Mapping[str, Any], algorithm: type[BaseAlgorithm]) -> None:
+    """Refuse settings that could not be trained, or not as what they say.
+
+    :raises ConfigError: for a key that nothing takes, a value that is not allowed, or a sparsity
+        that training would not reach
+    """
+    kwargs, callback = policy_kwargs_of(settings), find_callback(settings)
+    names = Names.of(algorithm)
+    algo = algorithm.__name__
+    _check_keys(settings, names.algorithm, f"{algo} and rl-zoo have no setting", names)
+    _check_keys(kwargs, names.policy, f"policy_kwargs of {algo} have no", names)
+    if callback is not None and not has_own_callback(settings):
+        allowed = names.schedule | {"method", "verbose"}
+        _check_keys(callback, allowed, f"{CALLBACK} has no argument", names)
+    for part in (settings, kwargs, callback or {}, kwargs.get("optimizer_kwargs") or {}):
+        for name, value in part.items():
+            _check_value(algo.lower(), name, value)
+    import_named(dict(kwargs))
+    if settings.get("noise_type") is not None and "noise_std" not in settings:
+        raise ConfigError("noise_type needs noise_std, e.g. noise_std: 0.1")
+    if "sparsity" not in kwargs:
+        raise ConfigError(SPARSITY_MISSING)
+    SparsityConfig(**{name: value for name, value in kwargs.items() if name in OF_SPARSITY})
+    check_weight_decay(kwargs.get("weight_decay", 0.0), kwargs.get("optimizer_kwargs"))
+    if callback is not None and not has_own_callback(settings):
+        SparsityCallback(**callback)
+    _check_start(kwargs, callback)
+
+
+def _check_keys(given: Mapping[str, Any], allowed: Set[str], what: str, names: Names) -> None:
+    for name in given:
+        if name in allowed:
+            continue
+        if name in names.policy:
+            cure = "; it is the policy's: put it under policy_kwargs"
+        elif name in names.schedule:
+            cure = f"; it is the mask's schedule's: put it under {CALLBACK}"
+        elif name in names.algorithm:
+            cure = "; it is the algorithm's: put it beside policy_kwargs"
+        elif name in SET_BY_THE_ENGINE:
+            cure = "; it is an option of its own"
+        else:
+            cure = did_you_mean(name, allowed)
+        raise ConfigError(f"{what} {name!r}{cure}. Allowed are {', '.join(sorted(allowed))}")
+
+
+def _check_value(algo: str, name: str, value: Any) -> None:
+    if isinstance(value, str) and _is_number(value):
+        raise ConfigError(
+            f"{name} is the text {value!r}, as YAML reads a number without a dot and a sign; write "
+            f"{name}: !!float {value}"
+        )
+    kind = kind_of(algo, name)
+    if kind is not None and not kind.fits(value):
+        raise ConfigError(f"{name} must be {kind.allowed}; got {value!r}")
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _check_start(kwargs: Mapping[str, Any], callback: Mapping[str, Any] | None) -> None:
+    """A denser start needs a method that takes it to the end, and such a method a denser start."""
+    initial, final = kwargs.get("initial_sparsity"), kwargs["sparsity"]
+    shares = list(final.values()) if isinstance(final, Mapping) else [final]
+    denser = initial is not None and any(initial < share for share in shares)
+    prunes = callback is not None and method_named(callback["method"]).reaches_final
+    if denser and not prunes:
+        how = "without a callback" if callback is None else f"with method {callback['method']!r}"
+        raise ConfigError(
+            f"initial_sparsity: {initial} begins denser than sparsity: {final}, and {how} training "
+            "would stay so; leave initial_sparsity out, or prune with "
+            f"callback: [{{{CALLBACK}: {{method: prune}}}}]"
+        )
+    if prunes and not denser:
+        assert callback is not None
+        raise ConfigError(
+            f"method {callback['method']!r} begins denser than it ends, but initial_sparsity is "
+            f"{initial} and sparsity {final}; give initial_sparsity: 0.0 and a sparsity above 0"
+        )
