@@ -25,6 +25,10 @@ class ConfigError(SparsityError, ValueError):
     """A value is outside of what is allowed; the message says what is."""
 
 
+class RunBusy(ConfigError):
+    """Another process is at work in a run's folder."""
+
+
 class UnsupportedError(SparsityError, TypeError):
     """An algorithm, layer or space that sparse training does not cover."""
 

@@ -39,12 +39,12 @@ def standing_of(cell: Cell, store: Path) -> CellStanding:
     :raises ConfigError: if its record is damaged
     """
     folder = cell.folder(store)
-    failed = cell.errors(store).is_file()
+    failed, running = cell.errors(store).is_file(), is_locked(folder)
     if not (folder / NAME).is_file():
-        return CellStanding(cell, folder, FAILED if failed else WAITING)
+        return CellStanding(cell, folder, RUNNING if running else FAILED if failed else WAITING)
     record = read_record(folder)
     steps = int(record.get("num_timesteps", 0))
-    if is_locked(folder):
+    if running:
         return CellStanding(cell, folder, RUNNING, steps)
     if record["status"] == OVER[cell.trained] and not cell.measures.missing(record):
         return CellStanding(cell, folder, DONE, steps)

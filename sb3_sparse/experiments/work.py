@@ -8,9 +8,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from sb3_sparse.errors import ConfigError, RunBusy
 from sb3_sparse.experiments.cell import Cell
 from sb3_sparse.experiments.measures import FILES
 from sb3_sparse.experiments.standing import DONE, OVER, RUNNING, STOPPED, standing_of
+from sb3_sparse.zoo.checkpoint import LOCK, locked
 from sb3_sparse.zoo.prepare import count
 from sb3_sparse.zoo.record import NAME, read_record, write_record
 from sb3_sparse.zoo.run import Run
@@ -27,17 +29,26 @@ def work_on(cell: Cell, store: Path) -> str:
     if standing.status in (DONE, RUNNING):
         return standing.status
     folder = standing.folder
-    if not cell.trained:
-        count(cell.run, folder)
-    elif not _trained(folder) and not _train(cell, folder):
-        return STOPPED
+    try:
+        if not cell.trained:
+            count(cell.run, folder)
+        elif not _trained(folder) and not _train(cell, folder):
+            return STOPPED
+        with locked(folder):
+            _measure(cell, folder)
+    except RunBusy:  # another process has begun it since
+        return RUNNING
+    cell.errors(store).unlink(missing_ok=True)
+    return DONE
+
+
+def _measure(cell: Cell, folder: Path) -> None:
+    """Measure what is still wanted of the trained model."""
     record = read_record(folder)
     for name, arguments in cell.measures.missing(record).items():
         _measure_noise(folder, Run(**record["run"]), arguments)
         measured = {**read_record(folder).get("measured", {}), name: dict(arguments)}
         write_record(folder, measured=measured)
-    cell.errors(store).unlink(missing_ok=True)
-    return DONE
 
 
 def _trained(folder: Path) -> bool:
@@ -49,10 +60,30 @@ def _train(cell: Cell, folder: Path) -> bool:
     from sb3_sparse.zoo.train import resume, train  # rl_zoo3 takes its time to import
 
     callbacks = cell.measures.callbacks(folder)
-    if (folder / NAME).is_file():
-        return resume(folder, callbacks).finished
-    shutil.rmtree(folder, ignore_errors=True)  # a process that was killed before it wrote anything
-    return train(cell.run, callbacks=callbacks, folder=folder).finished
+    try:
+        if (folder / NAME).is_file():
+            return resume(folder, callbacks).finished
+        _clear(folder)
+        return train(cell.run, callbacks=callbacks, folder=folder).finished
+    except RunBusy:
+        raise
+    except ConfigError:
+        if _trained(folder):  # by another process, since this one looked
+            return True
+        raise
+
+
+def _clear(folder: Path) -> None:
+    """Remove what a run without a record has left, unless some process is at it."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with locked(folder):
+        if (folder / NAME).is_file():  # it has begun since
+            return
+        for path in folder.iterdir():
+            if path.is_dir():
+                shutil.rmtree(path)
+            elif path.name != LOCK:
+                path.unlink()
 
 
 def _measure_noise(folder: Path, run: Run, arguments: Mapping[str, Any]) -> None:

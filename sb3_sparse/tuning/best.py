@@ -61,7 +61,9 @@ def write_best(study: optuna.Study, path: Path) -> Path:
     env_id = definition_of(study).run.env_id
     text = as_yaml({env_id: best_settings(study)})
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(f"# {describe_best(study)}\n{text}")
+    new = path.with_name(f"{path.name}.new")
+    new.write_text(f"# {describe_best(study)}\n{text}")
+    new.replace(path)
     return path
 
 

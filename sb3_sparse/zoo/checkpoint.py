@@ -7,7 +7,7 @@ import shutil
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
@@ -16,7 +16,7 @@ from filelock import FileLock, Timeout
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_sparse.errors import ConfigError
+from sb3_sparse.errors import RunBusy
 from sb3_sparse.zoo.evaluation import Evaluation
 from sb3_sparse.zoo.record import write_record
 from sb3_sparse.zoo.replay import BufferSaver
@@ -24,6 +24,8 @@ from sb3_sparse.zoo.replay import BufferSaver
 FOLDER = "resume"
 REPLAY_BUFFER = "replay_buffer"
 MONITOR = ".monitor.csv"
+LOCK = ".lock"
+PATIENCE = 1.0  # seconds; others hold the lock for a moment to see whether it is free
 
 
 class StopTraining(Exception):
@@ -137,51 +139,90 @@ def last_checkpoint(folder: Path) -> Path | None:
     return max(found, key=lambda path: int(path.name), default=None)
 
 
-def restore_monitors(folder: Path, checkpoint: Path | None) -> None:
+@contextmanager
+def restored_monitors(folder: Path, checkpoint: Path | None) -> Iterator[None]:
     """Set aside the training episodes that a checkpoint knows of, and forget all later ones.
 
     What was ``0.monitor.csv`` becomes ``0.1.monitor.csv``, and so on: a file for each time that the
-    run was started, since SB3 reads times relative to a file's own start.
+    run was started, since SB3 reads times relative to a file's own start. If what is done within
+    fails, all is as it was.
     """
-    for path in folder.glob(f"*{MONITOR}"):
-        path.unlink()
-    if checkpoint is None:
-        return
-    for path in checkpoint.glob(f"*{MONITOR}"):
+    before = {path: path.read_bytes() for path in folder.glob(f"*{MONITOR}")}
+    after = _monitors_in(checkpoint)
+    try:
+        _replace_monitors(folder, {folder / name: content for name, content in after.items()})
+        yield
+    except BaseException:
+        _replace_monitors(folder, before)
+        raise
+
+
+def _monitors_in(checkpoint: Path | None) -> dict[str, bytes]:
+    """Content of the training episodes' files by the names that they shall have."""
+    found: dict[str, bytes] = {}
+    for path in [] if checkpoint is None else checkpoint.glob(f"*{MONITOR}"):
         rank, *part = path.name.removesuffix(MONITOR).split(".")
         if not part:
-            part = [str(1 + len(list(checkpoint.glob(f"{rank}.*{MONITOR}"))))]
-        shutil.copy(path, folder / f"{rank}.{part[0]}{MONITOR}")
+            part = [str(1 + len(list(path.parent.glob(f"{rank}.*{MONITOR}"))))]
+        found[f"{rank}.{part[0]}{MONITOR}"] = path.read_bytes()
+    return found
+
+
+def _replace_monitors(folder: Path, contents: Mapping[Path, bytes]) -> None:
+    for path in folder.glob(f"*{MONITOR}"):
+        path.unlink()
+    for path, content in contents.items():
+        path.write_bytes(content)
 
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
     """Within it, no other process trains the run.
 
-    :raises ConfigError: if one does already
+    :raises RunBusy: if one does already
     """
-    lock = FileLock(folder / ".lock")
+    lock = FileLock(folder / LOCK)
     try:
-        lock.acquire(timeout=0)
+        lock.acquire(timeout=PATIENCE)
     except Timeout as error:
-        raise ConfigError(f"another process is at work in {folder}") from error
+        raise RunBusy(f"another process is at work in {folder}") from error
     try:
         yield
     finally:
         with suppress(OSError):  # Windows keeps an open file
-            (folder / ".lock").unlink()
+            (folder / LOCK).unlink()
         lock.release()
 
 
 def is_locked(folder: Path) -> bool:
-    """Whether some process trains the run now."""
-    if not (folder / ".lock").is_file():
+    """Whether some process trains the run now; nothing is written."""
+    try:
+        descriptor = os.open(folder / LOCK, os.O_RDONLY)
+    except FileNotFoundError:
         return False
     try:
-        with locked(folder):
+        return not _can_lock(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _can_lock(descriptor: int) -> bool:
+    if sys.platform == "win32":
+        import msvcrt
+
+        try:
+            msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
+            msvcrt.locking(descriptor, msvcrt.LK_UNLCK, 1)
+        except OSError:
             return False
-    except ConfigError:
         return True
+    import fcntl
+
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)  # gone when it is closed
+    except BlockingIOError:
+        return False
+    return True
 
 
 def clear_checkpoints(folder: Path) -> None:

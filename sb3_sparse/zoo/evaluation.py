@@ -4,17 +4,73 @@ from __future__ import annotations
 
 import json
 import shutil
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
+from zipfile import BadZipFile, ZipFile
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_sparse.errors import ConfigError
 from sb3_sparse.policies.mixin import SparsePolicyMixin
 
 NPZ = "evaluations.npz"
 BEST = "best_model.zip"
 STATE = "evaluation.json"
+
+
+@dataclass(frozen=True)
+class Evaluated:
+    """The evaluations in a checkpoint.
+
+    :param best_mean_reward: of the best model
+    :param timesteps: environment steps before each evaluation
+    :param results: returns of its episodes
+    :param lengths: steps of its episodes
+    :param successes: of its episodes, where the environment tells
+    """
+
+    best_mean_reward: float
+    timesteps: list[int] = field(default_factory=list)
+    results: list[list[float]] = field(default_factory=list)
+    lengths: list[list[int]] = field(default_factory=list)
+    successes: list[list[bool]] = field(default_factory=list)
+
+    @classmethod
+    def read(cls, folder: Path) -> Evaluated:
+        """Read them, and see that the best model is whole.
+
+        :raises ConfigError: if a file is damaged or missing
+        """
+        with _whole(folder / STATE) as path:
+            state = json.loads(path.read_text())
+            best, count = float(state["best_mean_reward"]), int(state["count"])
+        if (folder / BEST).is_file():
+            with _whole(folder / BEST) as path, ZipFile(path) as file:
+                damaged = file.testzip()
+                if damaged is not None:
+                    raise ValueError(f"its part {damaged} does not have the checksum it should")
+        if count == 0:
+            return cls(best)
+        names = ("timesteps", "results", "ep_lengths", "successes")
+        with _whole(folder / NPZ) as path, np.load(path) as saved:
+            return cls(best, *(saved[name].tolist() for name in names if name in saved))
+
+
+@contextmanager
+def _whole(path: Path) -> Iterator[Path]:
+    """Say which file is damaged."""
+    try:
+        yield path
+    except (OSError, EOFError, ValueError, KeyError, TypeError, BadZipFile, zlib.error) as error:
+        raise ConfigError(
+            f"{path} is damaged ({type(error).__name__}: {error}), and nothing was changed; "
+            "restore it from a copy, or train anew: the run keeps its best model and evaluations"
+        ) from error
 
 
 class Evaluation(EvalCallback):
@@ -75,21 +131,23 @@ class Evaluation(EvalCallback):
             (self.folder / name).unlink(missing_ok=True)
 
     def restore(self, folder: Path) -> None:
-        """Take back what :meth:`save` saved; what was evaluated after that is forgotten."""
-        self.forget()
-        state = json.loads((folder / STATE).read_text())
-        self.best_mean_reward = state["best_mean_reward"]
+        """Take back what :meth:`save` saved; what was evaluated after that is forgotten.
+
+        :raises ConfigError: if something of it is damaged; then all stays as it is
+        """
+        saved = Evaluated.read(folder)
         for name in (NPZ, BEST):
             if (folder / name).is_file():
-                shutil.copy(folder / name, self.folder / name)
-        if state["count"] == 0:
-            return
-        with np.load(folder / NPZ) as saved:
-            self.evaluations_timesteps = saved["timesteps"].tolist()
-            self.evaluations_results = saved["results"].tolist()
-            self.evaluations_length = saved["ep_lengths"].tolist()
-            if "successes" in saved:
-                self.evaluations_successes = saved["successes"].tolist()
+                new = self.folder / f"{name}.new"
+                shutil.copy(folder / name, new)
+                new.replace(self.folder / name)
+            else:
+                (self.folder / name).unlink(missing_ok=True)
+        self.best_mean_reward = saved.best_mean_reward
+        self.evaluations_timesteps = saved.timesteps
+        self.evaluations_results = saved.results
+        self.evaluations_length = saved.lengths
+        self.evaluations_successes = saved.successes
 
     def _on_training_start(self) -> None:
         self.next = (self.model.num_timesteps // self.every + 1) * self.every

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import shutil
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
 
@@ -19,12 +20,12 @@ from sb3_sparse.zoo.checkpoint import (
     clear_checkpoints,
     last_checkpoint,
     locked,
-    restore_monitors,
+    restored_monitors,
 )
-from sb3_sparse.zoo.evaluation import Evaluation
+from sb3_sparse.zoo.evaluation import Evaluated, Evaluation
 from sb3_sparse.zoo.experiment import Experiment, spaces_of
 from sb3_sparse.zoo.prepare import doubt, explained, prepare
-from sb3_sparse.zoo.record import read_record, sparsity_of, write_record
+from sb3_sparse.zoo.record import NAME, read_record, sparsity_of, write_record
 from sb3_sparse.zoo.results import Outcome, final_results
 from sb3_sparse.zoo.run import Run
 from sb3_sparse.zoo.speed import denormals_as_zero, use_few_threads
@@ -63,6 +64,11 @@ def train(
     else:
         folder.mkdir(parents=True, exist_ok=True)
     with locked(folder):
+        if (folder / NAME).is_file():
+            raise ConfigError(
+                f"there is a run in {folder} already; go on with it (sb3-sparse train --resume), "
+                "or give another folder"
+            )
         write_record(
             folder,
             status="running",
@@ -101,11 +107,16 @@ def resume(folder: Path, callbacks: Sequence[BaseCallback] = ()) -> Outcome:
         run = Run(**record["run"])
         settings, evaluation = record["settings"], record["evaluation"]
         start = folder if record.get("trained") else last_checkpoint(folder)
-        with explained(f"the run in {folder} cannot go on from {start or 'its start'}", run.env_id):
+        failure = (
+            f"nothing was changed: the run in {folder} cannot go on from {start or 'its start'}"
+        )
+        with explained(failure, run.env_id), ExitStack() as stack:
             observation_space, _ = spaces_of(run, settings, folder, evaluation)
             use_few_threads(observation_space)
             if start != folder:
-                restore_monitors(folder, start)
+                if start is not None:
+                    Evaluated.read(start)  # all is read before anything is replaced
+                stack.enter_context(restored_monitors(folder, start))
             experiment = Experiment(
                 run, settings, folder, evaluation, start, record["tensorboard_log"]
             )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import importlib
 import io
 import json
 import shutil
@@ -16,9 +17,11 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_sparse.experiments import Study, run_study, standing_of
 from sb3_sparse.experiments.noise import noisy_envs
+from sb3_sparse.experiments.standing import CellStanding
 from sb3_sparse.experiments.work import work_on
 from sb3_sparse.launch.base import Ended, Launcher, Task
-from sb3_sparse.zoo.record import read_record
+from sb3_sparse.zoo.checkpoint import locked
+from sb3_sparse.zoo.record import read_record, write_record
 
 QUICK = {
     "n_timesteps": 300,
@@ -140,9 +143,6 @@ def test_a_cell_that_fails_twice_is_reported_with_its_traceback_and_the_others_g
 
 
 def test_a_cell_that_another_process_trains_is_left_to_it(tmp_path):
-    from sb3_sparse.zoo.checkpoint import locked
-    from sb3_sparse.zoo.record import write_record
-
     made = study(tmp_path)
     store = tmp_path / "store"
     folder = made.cells[0].folder(store)
@@ -152,6 +152,39 @@ def test_a_cell_that_another_process_trains_is_left_to_it(tmp_path):
         assert standing_of(made.cells[0], store).status == "running"
         assert work_on(made.cells[0], store) == "running"
     assert read_record(folder)["num_timesteps"] == 7
+
+
+def test_a_cell_that_another_process_has_just_begun_is_left_to_it(tmp_path):
+
+    made = study(tmp_path)
+    store = tmp_path / "store"
+    folder = made.cells[0].folder(store)
+    folder.mkdir(parents=True)
+    (folder / "0.monitor.csv").write_text("of the other process")
+    with locked(folder):  # which has written no record yet
+        assert standing_of(made.cells[0], store).status == "running"
+        assert work_on(made.cells[0], store) == "running"
+    assert (folder / "0.monitor.csv").read_text() == "of the other process"
+
+
+def test_a_cell_that_another_process_takes_or_ends_after_one_has_looked_is_not_run_again(
+    trained, tmp_path, monkeypatch
+):
+    made, store = trained
+    copy = tmp_path / "store"
+    shutil.copytree(store, copy)
+    (cell, _), (folder, _) = made.cells, [cell.folder(copy) for cell in made.cells]
+    before = weights(folder)
+    work = importlib.import_module(work_on.__module__)
+    waiting = CellStanding(cell, folder, "waiting")
+    looks = iter([True])  # it looked as if there were nothing
+    monkeypatch.setattr(work, "standing_of", lambda *_: waiting)
+    really = work._trained
+    monkeypatch.setattr(work, "_trained", lambda f: not next(looks, False) and really(f))
+    assert work_on(cell, copy) == "done"
+    assert all(th.equal(value, before[name]) for name, value in weights(folder).items())
+    with locked(folder):
+        assert work_on(cell, copy) == "running"
 
 
 def test_counted_cells_have_sizes_and_no_model(tmp_path):

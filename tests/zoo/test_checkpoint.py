@@ -1,0 +1,110 @@
+"""Checkpoints: read whole before anything is replaced; and locks, which a look leaves alone."""
+
+from __future__ import annotations
+
+import shutil
+import signal
+from pathlib import Path
+from threading import Event, Thread
+
+import pytest
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_sparse.errors import ConfigError, RunBusy
+from sb3_sparse.zoo.checkpoint import is_locked, last_checkpoint, locked
+from sb3_sparse.zoo.record import read_record
+from sb3_sparse.zoo.run import Run
+from sb3_sparse.zoo.train import resume, train
+
+RUN = Run(
+    n_timesteps=800,
+    eval_freq=200,
+    eval_episodes=2,
+    hyperparams={"net_arch": [8], "batch_size": 16, "learning_starts": 50, "normalize": True},
+)
+
+
+class Stop(BaseCallback):
+    """What a user's Ctrl-C does after 500 steps."""
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps == 500:
+            signal.raise_signal(signal.SIGINT)
+        return True
+
+
+@pytest.fixture(scope="module")
+def stopped(tmp_path_factory):
+    """Folder of a run that was stopped after 500 steps."""
+    return train(RUN, tmp_path_factory.mktemp("logs"), [Stop()]).folder
+
+
+@pytest.fixture
+def folder(stopped, tmp_path):
+    """A copy of it."""
+    copy = tmp_path / "dqn" / stopped.name
+    shutil.copytree(stopped, copy)
+    return copy
+
+
+def content(folder: Path) -> dict[Path, bytes]:
+    """Every file but the one that notes where the run lies."""
+    files = (path for path in folder.rglob("*") if path.is_file() and path.name != "args.yml")
+    return {path: path.read_bytes() for path in files}
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "CartPole-v1.zip",
+        "CartPole-v1/vecnormalize.pkl",
+        "replay_buffer/rest.pkl",
+        "replay_buffer/0.npz",
+        "best_model.zip",
+        "evaluation.json",
+        "evaluations.npz",
+    ],
+)
+def test_a_damaged_file_of_a_checkpoint_costs_nothing_of_the_run(name, folder):
+    damaged = last_checkpoint(folder) / name
+    whole = damaged.read_bytes()
+    damaged.write_bytes(whole[: len(whole) // 2])
+    (folder / "best_model.zip").write_bytes(b"better than the checkpoint's")
+    before = content(folder)
+    assert {"0.monitor.csv", "evaluations.npz"} <= {path.name for path in before}
+    with pytest.raises(ConfigError, match="nothing was changed"):
+        resume(folder)
+    assert content(folder) == before
+    damaged.write_bytes(whole)
+    assert resume(folder).finished
+
+
+def test_a_run_is_not_trained_over_another(folder):
+    before = read_record(folder)
+    with pytest.raises(ConfigError, match="there is a run in .* already; go on with it"):
+        train(RUN, folder=folder)
+    assert read_record(folder) == before
+    assert last_checkpoint(folder).name == "500"
+
+
+def test_seeing_whether_a_run_is_locked_writes_nothing_and_stops_nobody(tmp_path):
+    assert not is_locked(tmp_path)
+    assert list(tmp_path.iterdir()) == []
+    with locked(tmp_path):
+        assert is_locked(tmp_path)
+        with pytest.raises(RunBusy, match="another process is at work"), locked(tmp_path):
+            pass
+    (tmp_path / ".lock").touch()  # of a process that was killed
+    looking = Event()
+
+    def look():
+        while not looking.is_set():
+            is_locked(tmp_path)
+
+    watcher = Thread(target=look)
+    watcher.start()
+    for _ in range(20):
+        with locked(tmp_path):
+            pass
+    looking.set()
+    watcher.join()
