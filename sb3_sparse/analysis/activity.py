@@ -16,6 +16,7 @@ from torch.utils import _pytree as pytree
 
 from sb3_sparse.analysis.networks import dense_twin, kernels_of, modules_of, specs_of
 from sb3_sparse.errors import ConfigError
+from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.policies.spec import output_layers
 
 CHUNK = 128
@@ -138,7 +139,8 @@ def activity(
 
     :raises ConfigError: without observations, or if actions do not fit them
     """
-    policy = model if isinstance(model, BasePolicy) else model.policy
+    model = unwrapped(model)
+    policy = model if isinstance(model, BasePolicy) else unwrapped(model.policy)
     twin = dense_twin(policy)
     tensors = _tensors(twin, observations)
     count = len(pytree.tree_leaves(tensors)[0])

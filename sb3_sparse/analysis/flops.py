@@ -15,6 +15,7 @@ from sb3_sparse.analysis.networks import kernels_of, modules_of, specs_of
 from sb3_sparse.analysis.passes import Pass, batch_size_of, passes_of
 from sb3_sparse.engine.network import SparseNetwork
 from sb3_sparse.errors import ConfigError
+from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.policies.mixin import SparsePolicyMixin
 from sb3_sparse.policies.report import LayerReport, SparsityReport, report_on
 
@@ -154,6 +155,7 @@ def flops(
     Source: arXiv:2206.10369; a step of three forward passes where all is trained as in
     arXiv:1911.11134.
     """
+    policy_or_model = unwrapped(policy_or_model)
     if isinstance(policy_or_model, BasePolicy):
         if batch_size is not None:
             raise ConfigError("batch_size means nothing for a policy; call flops with the model")
@@ -163,7 +165,7 @@ def flops(
     size = batch_size_of(model) if batch_size is None else batch_size
     if isinstance(size, bool) or not isinstance(size, int) or size < 1:
         raise ConfigError(f"batch_size must be an integer, 1 or more, got {size!r}")
-    policy = model.policy
+    policy = unwrapped(model.policy)
     times = _times(policy, passes)
     layers = tuple(_layer(r, size * times[r.name]) for r in _report(policy).layers)
     return FlopsReport(layers, type(model).__name__, size, tuple(passes))

@@ -17,6 +17,7 @@ from sb3_sparse.engine.linear import CompactLinear
 from sb3_sparse.engine.sequential import ChainedSequential
 from sb3_sparse.errors import UnsupportedError
 from sb3_sparse.policies.aliases import supported_algorithms
+from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.policies.mixin import SparsePolicyMixin
 from sb3_sparse.policies.spec import NetworkSpec
 
@@ -26,6 +27,7 @@ def specs_of(policy: BasePolicy) -> Mapping[str, NetworkSpec]:
 
     :raises UnsupportedError: for a policy without a counterpart, or with layers elsewhere
     """
+    policy = unwrapped(policy)
     if isinstance(policy, SparsePolicyMixin):
         return policy.networks
     for algorithm in supported_algorithms().values():
@@ -75,6 +77,7 @@ def parameters_by_network(policy: BasePolicy) -> dict[str, list[str]]:
 
     What lies in no network (the ``log_std`` of PPO) is the first's too.
     """
+    policy = unwrapped(policy)
     specs = specs_of(policy)
     names = {id(p): name for name, p in policy.named_parameters() if p.requires_grad}
     found: dict[str, list[str]] = {}
@@ -88,6 +91,7 @@ def parameters_by_network(policy: BasePolicy) -> dict[str, list[str]]:
 
 def connections(policy: BasePolicy) -> dict[str, NDArray[Any] | None]:
     """The mask of every kernel, flat, by its parameter's name; None where all are active."""
+    policy = unwrapped(policy)
     names = {id(p): name for name, p in policy.named_parameters()}
     found: dict[str, NDArray[Any] | None] = {}
     for spec in specs_of(policy).values():
@@ -109,6 +113,7 @@ def dense_twin(policy: BasePolicy) -> BasePolicy:
     It has no optimizers. Every layer has its dense weight, 0 where inactive, under the same
     parameter name, so that gradients at inactive connections can be taken.
     """
+    policy = unwrapped(policy)
     memo: dict[int, Any] = {}
     for module in policy.modules():
         for name, value in vars(module).items():

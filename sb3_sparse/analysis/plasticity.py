@@ -11,6 +11,7 @@ from sb3_sparse.analysis.maskhistory import MaskHistory
 from sb3_sparse.analysis.measurement import MeasurementCallback
 from sb3_sparse.analysis.networks import specs_of
 from sb3_sparse.errors import ConfigError
+from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.policies.mixin import SparsePolicyMixin
 
 
@@ -68,7 +69,7 @@ class PlasticityCallback(MeasurementCallback):
 
     def _on_training_start(self) -> None:
         super()._on_training_start()
-        policy = self.model.policy
+        policy = unwrapped(self.model.policy)
         self.history = None
         if isinstance(policy, SparsePolicyMixin):
             path = None if self.file is None else self.file.path.with_suffix(".masks.npz")

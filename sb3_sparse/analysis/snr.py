@@ -18,6 +18,7 @@ from sb3_sparse.analysis.losses import Loss, losses_for, unchecked_distributions
 from sb3_sparse.analysis.measurement import MeasurementCallback
 from sb3_sparse.analysis.networks import connections, dense_twin, parameters_by_network
 from sb3_sparse.errors import ConfigError
+from sb3_sparse.policies.compiled import unwrapped
 
 CHUNK_NUMBERS = 2**23
 """Numbers that the per-sample gradients of one chunk may have."""
@@ -176,7 +177,7 @@ def gradient_snr(
         batch = sample_batch(model, batch_size, seed)
     elif batch_size is not None:
         raise ConfigError("batch_size means nothing for a batch that is given")
-    policy = model.policy
+    policy = unwrapped(model.policy)
     twin, names, masks = dense_twin(policy), parameters_by_network(policy), connections(policy)
     results: dict[str, NetworkSNR] = {}
     with own_randomness(seed + 1, model.device):

@@ -14,6 +14,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from sb3_sparse.compress.guard import Interval
 from sb3_sparse.compress.search import Level
 from sb3_sparse.errors import ConfigError, CorruptStateError
+from sb3_sparse.policies.compiled import unwrapped
 
 NAME = "compress.json"
 FORMAT = 1
@@ -101,7 +102,7 @@ def _level(content: Mapping[str, Any]) -> Level:
 def fingerprint(model: BaseAlgorithm) -> str:
     """A hash of a model's policy and step count."""
     digest = hashlib.sha256(f"{type(model).__name__} {model.num_timesteps}".encode())
-    for name, tensor in sorted(model.policy.state_dict().items()):
+    for name, tensor in sorted(unwrapped(model.policy).state_dict().items()):
         digest.update(name.encode())
         digest.update(tensor.detach().cpu().numpy().tobytes())
     return digest.hexdigest()[:16]

@@ -18,6 +18,7 @@ from stable_baselines3.common.save_util import save_to_zip_file
 from sb3_sparse.engine.masked import MaskedLayer
 from sb3_sparse.errors import ConfigError, UnsupportedError
 from sb3_sparse.policies.aliases import supported_algorithms
+from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.policies.mixin import SparsePolicyMixin
 from sb3_sparse.policies.saving import load_without_buffer, parts_of
 from sb3_sparse.sparsity.selection import largest
@@ -102,8 +103,9 @@ def load_beside(
 
 def sparse_policy(model: BaseAlgorithm) -> SparsePolicyMixin:
     """The policy of a model that is known to be sparse."""
-    assert isinstance(model.policy, SparsePolicyMixin)
-    return model.policy
+    policy = unwrapped(model.policy)
+    assert isinstance(policy, SparsePolicyMixin)
+    return policy
 
 
 def sparsity_of(model: BaseAlgorithm) -> dict[str, float]:
@@ -111,7 +113,7 @@ def sparsity_of(model: BaseAlgorithm) -> dict[str, float]:
 
     :raises UnsupportedError: as :func:`sparsify`
     """
-    policy = model.policy
+    policy = unwrapped(model.policy)
     if isinstance(policy, SparsePolicyMixin):
         sizes = {network.name: network.size for network in policy.sparse.networks}
         return policy.sparsity_config.by_network(sizes)
@@ -139,7 +141,7 @@ def _sparse_class(model: BaseAlgorithm) -> type[SparsePolicyMixin]:
         raise UnsupportedError(
             f"{type(model).__name__} has no sparse policy; supported are {', '.join(supported)}"
         )
-    own = type(model.policy)
+    own = type(unwrapped(model.policy))
     if issubclass(own, SparsePolicyMixin):
         return own
     aliases = model.policy_aliases
@@ -170,7 +172,7 @@ def _pruned(model: BaseAlgorithm, data: Mapping[str, Any], saved: State) -> Stat
     missing = [key for key in found.missing_keys if not key.endswith((MASK, "_extra_state"))]
     if missing or found.unexpected_keys:
         raise UnsupportedError(
-            f"{type(model.policy).__name__} has other parameters than "
+            f"{type(unwrapped(model.policy)).__name__} has other parameters than "
             f"{type(policy).__name__} with the same policy_kwargs: "
             f"{', '.join([*missing, *found.unexpected_keys])}"
         )

@@ -28,6 +28,7 @@ from sb3_sparse.export.npz import write_npz
 from sb3_sparse.export.observations import Observations, count_of
 from sb3_sparse.export.parity import Actor
 from sb3_sparse.export.units import sort_units
+from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.policies.mixin import SparsePolicyMixin
 from sb3_sparse.policies.saving import load_without_buffer
 
@@ -119,7 +120,8 @@ def dense_artifact(model: BaseAlgorithm, normalised: bool) -> Artifact:
             "a zip of SB3 does not normalise observations: load the statistics with "
             "VecNormalize.load, as before"
         )
-    if isinstance(model.policy, SparsePolicyMixin) and model.policy.sparse.weight_decay:
+    policy = unwrapped(model.policy)
+    if isinstance(policy, SparsePolicyMixin) and policy.sparse.weight_decay:
         notes.append("weight_decay, which is of sparse policies, is left out")
     return Artifact({".zip": content}, actor, tuple(notes))
 

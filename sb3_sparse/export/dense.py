@@ -16,6 +16,7 @@ from stable_baselines3.common.save_util import is_json_serializable
 
 from sb3_sparse.errors import UnsupportedError
 from sb3_sparse.export.pathless import pickled
+from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.policies.config import SparsityConfig
 from sb3_sparse.policies.mixin import SparsePolicyMixin
 from sb3_sparse.policies.named import import_named
@@ -43,8 +44,9 @@ def write_dense(model: BaseAlgorithm) -> bytes:
     :raises UnsupportedError: if the model has classes of this package that SB3 lacks
     """
     data, params, variables = parts_of(model)
-    data["policy_class"] = _stock_class(type(model.policy))
-    data["policy_kwargs"] = _stock_kwargs(model.policy, data["policy_kwargs"])
+    policy = unwrapped(model.policy)
+    data["policy_class"] = _stock_class(type(policy))
+    data["policy_kwargs"] = _stock_kwargs(policy, data["policy_kwargs"])
     for name in FORGOTTEN:
         if name in data:
             data[name] = None

@@ -24,6 +24,7 @@ from sb3_sparse.export.graph import (
 )
 from sb3_sparse.export.trace import Tracer
 from sb3_sparse.policies.aliases import supported_algorithms
+from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.policies.mixin import SparsePolicyMixin
 
 
@@ -34,7 +35,7 @@ def graph_of(model: BaseAlgorithm, normalization: VecNormalize | None) -> Graph:
     :param normalization: what normalises observations before the policy sees them
     :raises UnsupportedError: for a network or space that cannot be exported
     """
-    policy: Any = model.policy
+    policy: Any = unwrapped(model.policy)
     policy.set_training_mode(False)
     space = check_observations(model.observation_space)
     tracer = Tracer(space.shape, {id(module): name for name, module in policy.named_modules()})
@@ -100,7 +101,7 @@ def check_model(model: BaseAlgorithm) -> None:
             f"a model of {type(model).__name__} cannot be exported; supported are "
             f"{', '.join(supported)}"
         )
-    policy = model.policy
+    policy = unwrapped(model.policy)
     for name, tensor in policy.state_dict().items():
         if tensor.is_floating_point() and not bool(tensor.isfinite().all()):
             raise CorruptStateError(

@@ -25,6 +25,7 @@ from sb3_sparse.export.graph import (
     Node,
     Normalize,
 )
+from sb3_sparse.policies.compiled import unwrapped
 
 Module = TypeVar("Module", bound=nn.Module)
 
@@ -69,6 +70,7 @@ class Tracer:
 
         :raises UnsupportedError: if it does what cannot be exported
         """
+        module = unwrapped(module)
         if getattr(module, "inplace", False):
             self.changed.update(self.sources(value))
         elementwise = nodes_of(module)

@@ -35,6 +35,7 @@ from sb3_sparse.export.observations import (
 from sb3_sparse.export.parity import TOLERANCE, Parity, ParityError, compare
 from sb3_sparse.export.quantize import quantized
 from sb3_sparse.export.units import remove_dead_units, units_of
+from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.policies.saving import BROKEN_PICKLE, was_normalised
 
 FORMATS = ("c", "numpy", "onnx", "dense")
@@ -245,7 +246,7 @@ def _connections(model: BaseAlgorithm) -> int:
     """Connections of all layers that are not 0, targets left out and shared layers once."""
     layers = [
         module
-        for name, module in model.policy.named_modules()
+        for name, module in unwrapped(model.policy).named_modules()
         if isinstance(module, (nn.Linear, nn.Conv2d)) and "target" not in name
     ]
     return sum(int(layer.weight.count_nonzero()) for layer in layers)

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TypeVar
 
-from torch import nn
+Policy = TypeVar("Policy")
+Value = TypeVar("Value")
 
-Module = TypeVar("Module", bound=nn.Module)
+WRAPPED = "_orig_mod"
 
 
-def unwrapped(policy: Module) -> Module:
+def unwrapped(policy: Policy) -> Policy:
     """The policy itself, where ``torch.compile`` has wrapped it.
 
     ``torch.compile`` returns a module of a class of its own, ``OptimizedModule``, that passes
@@ -17,5 +19,10 @@ def unwrapped(policy: Module) -> Module:
 
     :param policy: compiled or not; parameters and hooks are the same in both
     """
-    found: Module = getattr(policy, "_orig_mod", policy)
+    found: Policy = getattr(policy, WRAPPED, policy)
     return found
+
+
+def plain_names(state: Mapping[str, Value]) -> dict[str, Value]:
+    """A state_dict under the names that it has without ``torch.compile``."""
+    return {name.replace(f"{WRAPPED}.", ""): value for name, value in state.items()}

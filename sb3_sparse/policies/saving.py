@@ -13,6 +13,8 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.save_util import load_from_zip_file
 
+from sb3_sparse.policies.compiled import plain_names
+
 Algorithm = TypeVar("Algorithm", bound=BaseAlgorithm)
 
 BROKEN_PICKLE = (
@@ -37,9 +39,11 @@ def parts_of(model: BaseAlgorithm) -> tuple[dict[str, Any], dict[str, Any], Any]
     file = io.BytesIO()
     model.save(file)
     file.seek(0)
-    data, params, variables = load_from_zip_file(file, device="cpu")
+    data, loaded, variables = load_from_zip_file(file, device="cpu")
     assert data is not None
-    return data, dict(params), variables
+    params: dict[str, Any] = dict(loaded)
+    params["policy"] = plain_names(params["policy"])
+    return data, params, variables
 
 
 def load_without_buffer(

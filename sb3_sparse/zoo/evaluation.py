@@ -16,6 +16,7 @@ from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_sparse.errors import ConfigError
+from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.policies.mixin import SparsePolicyMixin
 
 NPZ = "evaluations.npz"
@@ -156,7 +157,7 @@ class Evaluation(EvalCallback):
         if self.num_timesteps < self.next:
             return True
         self.next = (self.num_timesteps // self.every + 1) * self.every
-        policy = self.model.policy
+        policy = unwrapped(self.model.policy)
         assert isinstance(policy, SparsePolicyMixin)
         if not any(network.denser for network in policy.sparse.networks):
             return super()._on_step()

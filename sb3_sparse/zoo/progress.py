@@ -14,6 +14,7 @@ from rich.progress import (
 )
 from stable_baselines3.common.callbacks import BaseCallback
 
+from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.policies.mixin import SparsePolicyMixin
 
 REFRESH_STEPS = 100
@@ -49,13 +50,13 @@ class TrainingProgress(BaseCallback):
     def _status(self) -> str:
         returns = [float(episode["r"]) for episode in self.model.ep_info_buffer or ()]
         text = f"return {fmean(returns):.1f}" if returns else "return –"
-        policy = self.model.policy
+        policy = unwrapped(self.model.policy)
         if isinstance(policy, SparsePolicyMixin):
             text += f", sparsity {policy.sparse.sparsity:.2%}"
         return text
 
     def _say_what_was_chosen(self) -> None:
-        policy = self.model.policy
+        policy = unwrapped(self.model.policy)
         if isinstance(policy, SparsePolicyMixin):
             choice = policy.sparse.choice
             if choice is not self._choice:

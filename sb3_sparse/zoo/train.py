@@ -13,6 +13,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_sparse.errors import ConfigError
+from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.policies.mixin import SparsePolicyMixin
 from sb3_sparse.zoo.checkpoint import (
     Checkpoints,
@@ -141,7 +142,7 @@ def _learn(
     callbacks: Sequence[BaseCallback],
     after_evaluation: BaseCallback | None = None,
 ) -> Outcome:
-    policy = model.policy
+    policy = unwrapped(model.policy)
     assert isinstance(policy, SparsePolicyMixin)
     schedule = experiment.evaluation
     envs = experiment.evaluation_envs(
@@ -219,6 +220,6 @@ def new_run_folder(parent: Path, env_name: str) -> Path:
 
 def reached_sparsity(model: BaseAlgorithm) -> float:
     """Sparsity of a model now."""
-    policy = model.policy
+    policy = unwrapped(model.policy)
     assert isinstance(policy, SparsePolicyMixin)
     return policy.sparse.sparsity

@@ -1,14 +1,117 @@
-"""Policies that torch compiled."""
+"""Policies that torch compiled: whoever asks for a policy's class finds it."""
 
+import gymnasium as gym
+import numpy as np
+import pytest
 import torch as th
+from stable_baselines3.common.vec_env import DummyVecEnv
 from support import make
 
-from sb3_sparse.policies.compiled import unwrapped
+from sb3_sparse import sparsify
+from sb3_sparse.analysis import (
+    PlasticityCallback,
+    dormant_share,
+    effective_ranks,
+    flops,
+    gradient_snr,
+)
+from sb3_sparse.analysis.networks import connections, parameters_by_network, specs_of
+from sb3_sparse.compress import compress
+from sb3_sparse.export import FORMATS, export
+from sb3_sparse.policies.compiled import plain_names, unwrapped
+from sb3_sparse.zoo.inspect import inspect_model
+from sb3_sparse.zoo.saved import algo_of
+
+
+@pytest.fixture(autouse=True)
+def torch_as_it_was():
+    """``torch.compile`` switches the checks of distributions off, for the whole process."""
+    checked = th.distributions.Distribution._validate_args
+    th._dynamo.reset()
+    yield
+    th.distributions.Distribution.set_default_validate_args(checked)
+
+
+def compiled(algorithm, **arguments):
+    """A model, and the same again with its policy compiled."""
+    models = make(algorithm, **arguments), make(algorithm, **arguments)
+    models[1].policy = th.compile(models[1].policy, backend="eager")
+    return models
 
 
 def test_a_compiled_policy_is_unwrapped_and_any_other_is_itself():
     policy = make("PPO").policy
-    compiled = th.compile(policy, backend="eager")
-    assert type(compiled) is not type(policy)
-    assert unwrapped(compiled) is policy
+    wrapped = th.compile(policy, backend="eager")
+    assert type(wrapped) is not type(policy)
+    assert unwrapped(wrapped) is policy
     assert unwrapped(policy) is policy
+    assert plain_names(wrapped.state_dict()).keys() == policy.state_dict().keys()
+
+
+@pytest.mark.parametrize("policy", ["SparsePolicy", "MlpPolicy"])
+@pytest.mark.parametrize("algorithm", ["SAC", "PPO", "DQN"])
+def test_it_is_exported_as_before(algorithm, policy, tmp_path):
+    plain, wrapped = compiled(algorithm, policy=policy)
+    for to in FORMATS:
+        expected = export(plain, tmp_path / f"plain-{to}", to)
+        found = export(wrapped, tmp_path / f"wrapped-{to}", to)
+        assert found.parity.holds
+        assert (found.nnz, found.units, found.notes) == (
+            expected.nnz, expected.units, expected.notes
+        )  # fmt: skip
+    stock = type(plain).load(tmp_path / "wrapped-dense.zip")
+    assert type(stock.policy).__module__.startswith("stable_baselines3.")
+    assert stock.policy.state_dict().keys() == unwrapped(stock.policy).state_dict().keys()
+
+
+@pytest.mark.parametrize("compute", ["masked", "sparse"])
+def test_a_part_that_is_compiled_is_exported_too(compute, tmp_path):
+    model = make("SAC", policy_kwargs=dict(compute=compute))
+    actor = model.policy.actor
+    actor.latent_pi = th.compile(actor.latent_pi, backend="eager")
+    for to in FORMATS:
+        assert export(model, tmp_path / "policy", to).parity.holds
+
+
+@pytest.mark.parametrize("compute", ["masked", "sparse"])
+@pytest.mark.parametrize("algorithm", ["SAC", "PPO", "DQN"])
+def test_a_saved_one_is_loaded_inspected_and_made_sparser(algorithm, compute, tmp_path):
+    plain, wrapped = compiled(algorithm, policy_kwargs=dict(sparsity=0.7, compute=compute))
+    wrapped.save(tmp_path / "model.zip")
+    loaded = type(plain).load(tmp_path / "model.zip")
+    for name, value in plain.policy.state_dict().items():
+        assert th.equal(loaded.policy.state_dict()[name], value), name
+    assert algo_of(tmp_path / "model.zip") == algorithm.lower()
+    report = inspect_model(tmp_path / "model.zip").report
+    assert report == plain.policy.sparsity_report()
+    twins = sparsify(plain, 0.9), sparsify(wrapped, 0.9)
+    for name, value in twins[0].policy.state_dict().items():
+        assert th.equal(twins[1].policy.state_dict()[name], value), name
+    assert sparsify(compiled(algorithm, policy="MlpPolicy")[1], 0.9).policy.sparse.sparsity > 0.89
+
+
+@pytest.mark.parametrize("policy", ["SparsePolicy", "MlpPolicy"])
+@pytest.mark.parametrize("algorithm", ["SAC", "PPO", "DQN"])
+def test_it_is_analysed_as_before(algorithm, policy):
+    plain, wrapped = compiled(algorithm, policy=policy)
+    assert specs_of(wrapped.policy) == specs_of(plain.policy)
+    assert parameters_by_network(wrapped.policy) == parameters_by_network(plain.policy)
+    assert connections(wrapped.policy).keys() == connections(plain.policy).keys()
+    assert flops(wrapped) == flops(plain)
+    assert flops(wrapped.policy) == flops(plain.policy)
+    seen = np.random.default_rng(0).normal(size=(8, *plain.observation_space.shape))
+    seen = seen.astype(np.float32)
+    assert dormant_share(wrapped.policy, seen) == dormant_share(plain.policy, seen)
+    assert effective_ranks(wrapped, seen) == effective_ranks(plain, seen)
+    for model in (plain, wrapped):
+        model.set_random_seed(0)
+        model.learn(64, callback=PlasticityCallback(every=32))
+    assert gradient_snr(wrapped, batch_size=8) == gradient_snr(plain, batch_size=8)
+
+
+def test_it_is_compressed(tmp_path):
+    _, model = compiled("PPO", env="CartPole-v1", policy="MlpPolicy")
+    envs = DummyVecEnv([lambda: gym.make("CartPole-v1")])
+    outcome = compress(model, envs, tmp_path / "out", sparsity=0.5, steps=64, episodes=2)
+    assert outcome.sparsity["actor"] == pytest.approx(0.5, abs=0.01)
+    assert type(model).load(outcome.path).policy.sparsity_report().sparsity("actor") > 0.49

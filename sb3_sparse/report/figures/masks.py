@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch as th
 
+from sb3_sparse.policies.compiled import plain_names
 from sb3_sparse.report.backend import MaxNLocator
 from sb3_sparse.report.data import Array, RunData
 from sb3_sparse.report.figures.base import Drawing, figure, panels
@@ -96,7 +97,7 @@ def masks_of(run: RunData) -> list[tuple[str, tuple[int, ...], Array]]:
             )
     except zipfile.BadZipFile as error:
         raise OSError(f"{path.name} is damaged: {error}") from error
-    found = []
+    state, found = plain_names(state), []
     for layer in run.layers:
         mask = state.get(f"{layer['name']}.weight_mask")
         if mask is not None:
