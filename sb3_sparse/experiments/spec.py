@@ -2,26 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, fields
 from itertools import product
 from pathlib import Path
 from typing import Any
 
-from sb3_sparse.callback import SparsityCallback
-from sb3_sparse.errors import ConfigError
+from sb3_sparse.errors import ConfigError, did_you_mean
 from sb3_sparse.experiments.cell import Cell
 from sb3_sparse.experiments.measures import Measures
-from sb3_sparse.topology import method_named
+from sb3_sparse.topology import method_named, method_names
 from sb3_sparse.zoo.configs import read_yaml
 from sb3_sparse.zoo.run import Run
-from sb3_sparse.zoo.settings import find_callback
+from sb3_sparse.zoo.settings import Names, find_callback
 
 SHIPPED = Path(__file__).parent / "studies"
 SCALES = ("smoke", "small", "paper")
 KEYS = {"title", "figures", "varies", "common", "runs", "scales", "measures", "trained"}
 RUN_KEYS = {one.name for one in fields(Run)} - {"seed", "device", "entry"}
+CHOSEN = ("sparsity", "match_params", "method", "distribution", "algo")
+"""What a scale chooses among a block's own values."""
 VARY, SEEDS, MEASURES, SCHEDULE = "vary", "seeds", "measures", "schedule"
 
 
@@ -62,8 +63,8 @@ class Study:
             path = SHIPPED / f"{what}.yml"
             if not path.is_file():
                 raise ConfigError(
-                    f"unknown study {what!r}; allowed are {', '.join(study_names())}, or a file "
-                    "of your own, .yml (docs/studies.md)"
+                    f"unknown study {what!r}{did_you_mean(what, study_names())}; allowed are "
+                    f"{', '.join(study_names())}, or a file of your own, .yml (docs/studies.md)"
                 )
         content = read_yaml(path, "title, figures, runs and scales")
         check_keys(content, KEYS, str(path))
@@ -77,7 +78,8 @@ class Study:
             raise ConfigError(f"{path}: the figure sensitivity needs varies, a setting's name")
         if not isinstance(scales, Mapping) or scale not in scales:
             known = isinstance(scales, Mapping) and ", ".join(scales) or repr(scales)
-            raise ConfigError(f"{path} has no scale {scale!r}, only {known}")
+            near = did_you_mean(scale, map(str, scales)) if isinstance(scales, Mapping) else ""
+            raise ConfigError(f"{path} has no scale {scale!r}{near}, only {known}")
         try:
             cells = tuple(_cells(content, scales[scale] or {}))
         except ConfigError as error:
@@ -88,6 +90,7 @@ class Study:
                 "sparsity in common, or runs is empty (docs/studies.md)"
             )
         title, varies = str(content["title"]), content.get("varies")
+        _check_varies(varies, cells, path)
         return cls(path.stem, scale, title, tuple(figures), varies, cells)
 
     @property
@@ -105,8 +108,9 @@ def check_keys(given: Any, allowed: set[str], where: str) -> None:
         raise ConfigError(f"{where} must be a mapping, got {given!r}")
     unknown = [str(key) for key in given if key not in allowed]
     if unknown:
+        nearest = did_you_mean(unknown[0], allowed)
         raise ConfigError(
-            f"{where} has unknown keys {', '.join(unknown)}; allowed are "
+            f"{where} has unknown keys {', '.join(unknown)}{nearest}; allowed are "
             f"{', '.join(sorted(allowed))}"
         )
 
@@ -127,6 +131,9 @@ def _cells(content: Mapping[str, Any], of_scale: Any) -> Iterator[Cell]:
     trained = content.get("trained", True)
     if not isinstance(trained, bool):
         raise ConfigError(f"trained must be true or false, got {trained!r}")
+    _check_schedule(schedule)
+    blocks = [_block(content.get("common", {}), block, {}) for block in content["runs"]]
+    _check_choices(blocks, scale)
     runs = [
         arguments
         for block in content["runs"]
@@ -140,10 +147,58 @@ def _cells(content: Mapping[str, Any], of_scale: Any) -> Iterator[Cell]:
             measures.check(cell.run.algorithm)
             if cell.address not in seen:
                 seen.add(cell.address)
-                callback = find_callback(cell.run.settings())
-                if callback is not None:
-                    SparsityCallback(**callback)  # refuses here what it would refuse in the run
                 yield cell
+
+
+def _check_varies(varies: Any, cells: Sequence[Cell], path: Path) -> None:
+    if varies is None:
+        return
+    known: set[str] = set()
+    for algorithm in {cell.run.algorithm for cell in cells}:
+        names = Names.of(algorithm)
+        known |= names.algorithm | names.policy | names.schedule
+    if not isinstance(varies, str) or varies not in known:
+        raise ConfigError(
+            f"{path}: varies must be the name of a setting, e.g. batch_size, got {varies!r}"
+            f"{did_you_mean(varies, known)}"
+        )
+
+
+def _check_schedule(schedule: Mapping[str, Any]) -> None:
+    known = {name for method in method_names() for name in method_named(method).options}
+    for name in schedule:
+        if name not in known:
+            raise ConfigError(
+                f"schedule has {name!r}, which no method takes{did_you_mean(name, known)}; allowed "
+                f"are {', '.join(sorted(known))}"
+            )
+
+
+def _check_choices(blocks: Sequence[Mapping[str, Any]], scale: Mapping[str, Any]) -> None:
+    """Refuse what a scale chooses and no block has: it would drop runs without a word.
+
+    :param blocks: as they stand, without the scale
+    """
+    varied = scale.get(VARY, {})
+    check_lists(varied)
+    chosen = {key: (scale[key], [one.get(key) for one in blocks]) for key in CHOSEN if key in scale}
+    for key, values in varied.items():
+        chosen[f"{VARY}: {key}"] = (values, [one.get(VARY, {}).get(key) for one in blocks])
+    for key, (wanted, given) in chosen.items():
+        known = [value for values in given if values is not None for value in _as_list(values)]
+        if not known:
+            raise ConfigError(f"the scale chooses {key}, which no block has; put it into a block")
+        for value in [] if key.startswith(VARY) else _as_list(wanted):
+            if value not in known:
+                allowed = ", ".join(dict.fromkeys(map(repr, known)))
+                raise ConfigError(
+                    f"the scale chooses {key}: {value!r}, which no block has"
+                    f"{did_you_mean(value, map(str, known))}; their values are {allowed}"
+                )
+
+
+def _as_list(value: Any) -> list[Any]:
+    return value if isinstance(value, list) else [value]
 
 
 def _with_schedule(arguments: dict[str, Any], schedule: Mapping[str, Any]) -> dict[str, Any]:
@@ -171,6 +226,7 @@ def _block(common: Any, block: Any, scale: Mapping[str, Any]) -> dict[str, Any]:
                 f"hyperparams must be a mapping, e.g. gamma: 0.98, got {part['hyperparams']!r}"
             )
     made: dict[str, Any] = deepcopy({**common, **block})
+    check_lists(made.get(VARY, {}))
     made["hyperparams"] = {
         name: value
         for part in (common, block, scale)
@@ -180,7 +236,7 @@ def _block(common: Any, block: Any, scale: Mapping[str, Any]) -> dict[str, Any]:
         if key == VARY:
             known = made.get(VARY, {})
             made[VARY] = {**known, **{name: value[name] for name in known if name in value}}
-        elif key in ("sparsity", "match_params", "method", "distribution", "algo"):
+        elif key in CHOSEN:
             made[key] = _kept(made[key], value) if key in made else None
         elif key != "hyperparams":
             made[key] = value
@@ -189,18 +245,15 @@ def _block(common: Any, block: Any, scale: Mapping[str, Any]) -> dict[str, Any]:
 
 def _kept(of_block: Any, of_scale: Any) -> Any:
     """What a scale leaves of a block's values: those that both have."""
-    if not isinstance(of_block, list):
-        return of_block if not isinstance(of_scale, list) or of_block in of_scale else []
-    wanted = of_scale if isinstance(of_scale, list) else [of_scale]
-    return [value for value in of_block if value in wanted]
+    wanted = _as_list(of_scale)
+    return [value for value in _as_list(of_block) if value in wanted]
 
 
 def _grid(block: dict[str, Any]) -> Iterator[dict[str, Any]]:
     """Every combination of the lists in a block, and of what it varies."""
     varied = block.pop(VARY, {})
-    check_lists(varied)
     hyperparams = block.pop("hyperparams", {})
-    lists = {key: value if isinstance(value, list) else [value] for key, value in block.items()}
+    lists = {key: _as_list(value) for key, value in block.items()}
     for values in product(*lists.values()):
         for chosen in product(*varied.values()):
             yield {

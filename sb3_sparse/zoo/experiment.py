@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import warnings
 from argparse import Namespace
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
@@ -20,6 +21,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from sb3_sparse.errors import MissingExtra
 from sb3_sparse.policies.saving import load_without_buffer
 from sb3_sparse.zoo.checkpoint import REPLAY_BUFFER
+from sb3_sparse.zoo.record import write_record
 from sb3_sparse.zoo.replay import end_episodes, restore_buffer
 from sb3_sparse.zoo.run import Run
 
@@ -104,12 +106,23 @@ class Experiment(ExperimentManager):
             made = self.setup_experiment()
         assert made is not None  # it is only when optimizing hyperparameters
         model = made[0]
-        buffer = Path(self.trained_agent).parent / REPLAY_BUFFER
-        if isinstance(model, OffPolicyAlgorithm) and self.continue_training and buffer.is_dir():
-            assert model.replay_buffer is not None
-            restore_buffer(model.replay_buffer, buffer)
-            end_episodes(model.replay_buffer)
+        if isinstance(model, OffPolicyAlgorithm) and self.continue_training and not self.trained:
+            self._restore_buffer(model)
         return model
+
+    def _restore_buffer(self, model: OffPolicyAlgorithm) -> None:
+        folder = Path(self.trained_agent).parent / REPLAY_BUFFER
+        if not folder.is_dir():
+            warnings.warn(
+                f"there is no replay buffer in {folder}: the run goes on with an empty one, which "
+                "trains otherwise than an uninterrupted run",
+                stacklevel=2,
+            )
+            write_record(Path(self.save_path), without_buffer_from=model.num_timesteps)
+            return
+        assert model.replay_buffer is not None
+        restore_buffer(model.replay_buffer, folder)
+        end_episodes(model.replay_buffer)
 
     def save(self, model: BaseAlgorithm) -> Path:
         """Save the model as rl-zoo does; where."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import pickle
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
+
+from sb3_sparse.errors import ConfigError
 
 ROWS = 10_000  # of one file
 LARGE = ("observations", "next_observations")  # written once and never changed; all else is small
@@ -49,7 +51,7 @@ class BufferSaver:
         with (folder / REST).open("wb") as file:
             pickle.dump(rest, file, protocol=pickle.HIGHEST_PROTOCOL)
         changed = self._changed(rows)
-        filled = buffer.buffer_size if buffer.full else min(buffer.pos + 1, buffer.buffer_size)
+        filled = _filled(buffer.pos, buffer.full, buffer.buffer_size)
         for number in range(-(-filled // ROWS)):
             name = f"{number}.npz"
             if self.last is None or number in changed or not (self.last / name).is_file():
@@ -72,15 +74,61 @@ class BufferSaver:
 
 
 def restore_buffer(buffer: BaseBuffer, folder: Path) -> None:
-    """Fill a new buffer of the same kind and size with what was saved."""
-    for path in folder.glob("*.npz"):
-        with np.load(path) as saved:
-            for key, array in _large_arrays(buffer):
-                rows = saved[key]
-                begin = int(path.stem) * ROWS
-                array[begin : begin + len(rows)] = rows
-    with (folder / REST).open("rb") as file:
-        vars(buffer).update(pickle.load(file))
+    """Fill a new buffer of the same kind and size with what was saved.
+
+    :raises ConfigError: if a part of it is missing, damaged or of another size; what is not there
+        would be rows of zeros, which training takes for experience
+    """
+    rest = _read(folder, REST, _unpickled)
+    for name in ("pos", "full", "buffer_size"):
+        if name not in rest:
+            raise _lacking(folder, REST, f"has no {name!r}")
+    if rest["buffer_size"] != buffer.buffer_size:
+        raise _lacking(folder, REST, f"is of {rest['buffer_size']} rows, not {buffer.buffer_size}")
+    filled = _filled(rest["pos"], rest["full"], buffer.buffer_size)
+    for number in range(-(-filled // ROWS)):
+        begin, end = number * ROWS, min((number + 1) * ROWS, filled)
+        name = f"{number}.npz"
+        saved = _read(folder, name, _arrays)
+        for key, array in _large_arrays(buffer):
+            rows = saved.get(key)
+            shape = None if rows is None else rows.shape
+            if shape != array[begin:end].shape:
+                wanted = f"{key!r} of shape {array[begin:end].shape}"
+                raise _lacking(folder, name, f"should hold {wanted}, and holds {shape}")
+            array[begin:end] = rows
+    vars(buffer).update(rest)
+
+
+def _filled(position: int, full: bool, size: int) -> int:
+    """Rows that are in use; with ``optimize_memory_usage`` the one at the position is too."""
+    return size if full else min(position + 1, size)
+
+
+def _read(folder: Path, name: str, how: Callable[[Path], dict[str, Any]]) -> dict[str, Any]:
+    if not (folder / name).is_file():
+        raise _lacking(folder, name, "is missing")
+    try:
+        return how(folder / name)
+    except Exception as error:  # damaged bytes make pickle raise anything
+        raise _lacking(folder, name, f"is damaged ({type(error).__name__}: {error})") from error
+
+
+def _unpickled(path: Path) -> dict[str, Any]:
+    with path.open("rb") as file:
+        return dict(pickle.load(file))
+
+
+def _arrays(path: Path) -> dict[str, Any]:
+    with np.load(path) as saved:
+        return dict(saved)
+
+
+def _lacking(folder: Path, name: str, what: str) -> ConfigError:
+    return ConfigError(
+        f"the replay buffer in {folder} is not whole: {name} {what}. Restore it from a copy, or "
+        "delete that folder to go on with an empty buffer"
+    )
 
 
 def end_episodes(buffer: BaseBuffer) -> None:

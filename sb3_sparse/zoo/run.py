@@ -14,13 +14,22 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from sb3_sparse.errors import ConfigError, did_you_mean
 from sb3_sparse.policies.aliases import supported_algorithms
 from sb3_sparse.sparsity.distributions import check_distribution, check_sparsity
-from sb3_sparse.zoo.arguments import is_whole
+from sb3_sparse.zoo.arguments import MAPPING, Kind, is_whole
 from sb3_sparse.zoo.configs import config_path, entry_of, evaluation_of
 from sb3_sparse.zoo.environments import is_atari, known_environment
 from sb3_sparse.zoo.settings import apply_overrides, method_of, policy_kwargs_of
 from sb3_sparse.zoo.validation import check_settings
 
 DENSE = "dense"
+_TEXT = Kind("a text", lambda v: isinstance(v, str))
+_WHOLE = Kind("a whole number, e.g. 100000", is_whole)
+COUNTS = ("n_timesteps", "n_envs", "eval_freq", "eval_episodes")
+TYPES = {
+    **dict.fromkeys(("algo", "env_id", "device", "method", "conf_file"), _TEXT),
+    **dict.fromkeys(("hyperparams", "entry"), MAPPING),
+    **dict.fromkeys(("seed", *COUNTS), _WHOLE),
+}
+OPTIONAL = frozenset({"method", "conf_file", "entry", *COUNTS})
 
 
 @dataclass(frozen=True)
@@ -78,7 +87,7 @@ class Run:
             check_sparsity(self.sparsity)
         if self.distribution is not None:
             check_distribution(self.distribution)
-        for name in ("n_timesteps", "n_envs", "eval_freq", "eval_episodes"):
+        for name in COUNTS:
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise ConfigError(f"{name} must be 1 or more, got {value}")
@@ -88,21 +97,11 @@ class Run:
             check_sparsity(self.match_params, "match_params")
 
     def _check_types(self) -> None:
-        for names, what, fits in (
-            (("algo", "env_id", "device"), "a text", lambda v: isinstance(v, str)),
-            (("method", "conf_file"), "a text", lambda v: v is None or isinstance(v, str)),
-            (("hyperparams",), "a mapping", lambda v: isinstance(v, Mapping)),
-            (("entry",), "a mapping", lambda v: v is None or isinstance(v, Mapping)),
-            (("seed",), "a whole number, e.g. 3", is_whole),
-            (
-                ("n_timesteps", "n_envs", "eval_freq", "eval_episodes"),
-                "a whole number, e.g. 100000",
-                lambda v: v is None or is_whole(v),
-            ),
-        ):
-            for name in names:
-                if not fits(getattr(self, name)):
-                    raise ConfigError(f"{name} must be {what}, got {getattr(self, name)!r}")
+        for name, kind in TYPES.items():
+            value = getattr(self, name)
+            optional = name in OPTIONAL and value is None
+            if not optional and not kind.fits(value):
+                raise ConfigError(f"{name} must be {kind.allowed}, got {value!r}")
 
     @property
     def algorithm(self) -> type[BaseAlgorithm]:

@@ -135,6 +135,24 @@ def test_a_scales_schedule_is_for_masks_that_move(tmp_path):
             "method 'static' has no update_interval",
         ),
         ({"runs": [{"method": "dense", "sparsity": 0.9}]}, "dense training has no sparsity"),
+        ({"scales": {"smoke": {"method": "abc"}}}, "chooses method: 'abc', which no block has"),
+        ({"scales": {"smoke": {"method": ["set", "rigel"]}}}, "did you mean 'rigl'"),
+        (
+            {"scales": {"smoke": {"sparsity": [0.9, 0.95]}}},
+            "0.95, which no block has",
+        ),
+        ({"scales": {"smoke": {"match_params": [0.9]}}}, "match_params, which no block has"),
+        ({"scales": {"smoke": {"distribution": "erk"}}}, "distribution, which no block has"),
+        ({"scales": {"smoke": {"algo": "sac"}}}, "algo: 'sac', which no block has"),
+        ({"scales": {"smoke": {"vary": {"gamma": [0.9]}}}}, "vary: gamma, which no block has"),
+        (
+            {"scales": {"smoke": {"schedule": {"update_intervall": 5}}}},
+            "schedule has 'update_intervall', which no method takes (did you mean",
+        ),
+        ({"scales": {"smal": {}, "smok": {}}}, "no scale 'smoke' (did you mean 'smok'?), only"),
+        ({"runs": [{"method": "dense", "vary": [3]}]}, "vary must map"),
+        ({"varies": "batchsize"}, "got 'batchsize' (did you mean 'batch_size'?)"),
+        ({"varies": ["gamma"]}, "varies must be the name of a setting"),
     ],
 )
 def test_mistakes_are_named_with_the_file(tmp_path, changed, said):
@@ -143,7 +161,16 @@ def test_mistakes_are_named_with_the_file(tmp_path, changed, said):
     assert said in str(caught.value)
 
 
-def test_an_unknown_study_is_answered_with_all_names():
+def test_a_scale_chooses_among_single_values_as_among_lists(tmp_path):
+    runs = [{"method": "rigl", "sparsity": 0.9}, {"method": "set", "sparsity": 0.5}]
+    for choice in ("set", ["set"]):
+        cells = read(tmp_path, runs=runs, scales={"smoke": {"method": choice}}).cells
+        assert {cell.run.method for cell in cells} == {"set"}
+
+
+def test_an_unknown_study_is_answered_with_the_nearest_and_all_names():
+    with pytest.raises(ConfigError, match=r"'clasic_control' \(did you mean 'classic_control'\?\)"):
+        Study.read("clasic_control", "small")
     with pytest.raises(ConfigError, match="classic_control"):
         Study.read("figure_7", "small")
 

@@ -15,6 +15,7 @@ from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 from stable_baselines3.common.envs import BitFlippingEnv
 
 import sb3_sparse.zoo.replay as replay
+from sb3_sparse.errors import ConfigError
 from sb3_sparse.zoo.replay import BufferSaver, end_episodes, restore_buffer
 
 VECTOR = spaces.Box(-1, 1, (3,), np.float32)
@@ -143,3 +144,58 @@ def test_hindsight_replay_comes_back_without_its_unfinished_episode(tmp_path):
     assert (lengths <= 5).all()
     sample = again.replay_buffer.sample(16)
     assert sample.observations["observation"].shape[0] == 16
+
+
+def delete(path):
+    path.unlink()
+
+
+def halve(path):
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def drop_key(path):
+    with np.load(path) as saved:
+        kept = dict(saved)
+    kept.popitem()
+    np.savez(path, **kept)
+
+
+def shorten(path):
+    with np.load(path) as saved:
+        kept = {key: rows[:-1] for key, rows in saved.items()}
+    np.savez(path, **kept)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    ("name", "spoil", "said"),
+    [
+        ("0.npz", delete, "0.npz is missing"),
+        ("2.npz", delete, "2.npz is missing"),
+        ("rest.pkl", delete, "rest.pkl is missing"),
+        ("1.npz", halve, "1.npz is damaged"),
+        ("rest.pkl", halve, "rest.pkl is damaged"),
+        ("1.npz", drop_key, "1.npz should hold .* and holds None"),
+        ("2.npz", shorten, "2.npz should hold"),
+    ],
+)
+def test_a_buffer_of_which_a_part_is_lost_is_refused_and_never_filled_with_zeros(
+    kind, name, spoil, said, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(replay, "ROWS", 10)
+    buffer = KINDS[kind](50)
+    fill(buffer, 25, np.random.default_rng(0))
+    BufferSaver(buffer).save(tmp_path / "b", 25)
+    restore_buffer(KINDS[kind](50), tmp_path / "b")  # as it is, it goes
+    spoil(tmp_path / "b" / name)
+    with pytest.raises(ConfigError, match=f"is not whole: {said}.*delete that folder to go on"):
+        restore_buffer(KINDS[kind](50), tmp_path / "b")
+
+
+def test_a_buffer_of_another_size_is_refused(tmp_path):
+    buffer = KINDS["vectors"](50)
+    fill(buffer, 25, np.random.default_rng(0))
+    BufferSaver(buffer).save(tmp_path / "b", 25)
+    with pytest.raises(ConfigError, match=r"rest\.pkl is of 50 rows, not 40"):
+        restore_buffer(KINDS["vectors"](40), tmp_path / "b")

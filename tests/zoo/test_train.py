@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import signal
 from dataclasses import replace
 from pathlib import Path
@@ -262,6 +263,21 @@ def test_a_checkpoint_that_cannot_be_read_is_named(tmp_path):
         resume(stopped.folder)
 
 
+def test_a_run_whose_buffer_is_not_whole_goes_on_with_none_only_when_told(tmp_path):
+    stopped = train(DQN_RUN, tmp_path, [Stop(500)])
+    buffer = last_checkpoint(stopped.folder) / "replay_buffer"
+    (buffer / "0.npz").unlink()
+    with pytest.raises(ConfigError, match="0.npz is missing. Restore it from a copy, or delete"):
+        resume(stopped.folder)
+    assert read_record(stopped.folder)["status"] == "interrupted"
+    shutil.rmtree(buffer)
+    with pytest.warns(UserWarning, match="goes on with an empty one"):
+        done = resume(stopped.folder)
+    assert done.finished
+    assert done.model.replay_buffer.size() == 500  # of 1000
+    assert read_record(stopped.folder)["without_buffer_from"] == 500
+
+
 def test_an_environment_that_breaks_loses_nothing_of_a_trained_run(tmp_path, monkeypatch):
     def die(*args, **kwargs):
         raise RuntimeError("no simulator")
@@ -281,8 +297,8 @@ def test_an_environment_that_breaks_loses_nothing_of_a_trained_run(tmp_path, mon
 
 
 def test_a_run_that_cannot_begin_leaves_nothing(tmp_path):
-    wrong = replace(DQN_RUN, hyperparams={**DQN_RUN.hyperparams, "initial_sparsity": 0.3})
-    with pytest.raises(ConfigError, match="never take it to its sparsity"):
+    wrong = replace(DQN_RUN, hyperparams={**DQN_RUN.hyperparams, "optimizer_kwargs": {"eps": -1}})
+    with pytest.raises(ConfigError, match="do not work: ValueError: Invalid epsilon"):
         train(wrong, tmp_path)
     assert not list((tmp_path / "dqn").iterdir())
 
