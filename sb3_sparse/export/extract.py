@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
+from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.distributions import StateDependentNoiseDistribution
 from stable_baselines3.common.preprocessing import is_image_space
@@ -176,6 +177,14 @@ def _box(tracer: Tracer, value: int, policy: Any, space: spaces.Box) -> None:
             tracer.add(Affine((value,), shape, scale, low + scale))
     else:
         tracer.add(Clip((value,), shape, low, high))
+
+
+def span_of(model: BaseAlgorithm) -> NDArray[np.float64]:
+    """Half the range of each action that is squashed into it, shape ``(actions,)``; else 0."""
+    space = model.action_space
+    if not (isinstance(space, spaces.Box) and unwrapped(model.policy).squash_output):
+        return np.zeros(1)
+    return (space.high.reshape(-1).astype(np.float64) - space.low.reshape(-1)) / 2.0
 
 
 def _scaled(value: int, shape: tuple[int, ...], scale: float, shift: float) -> Affine:

@@ -28,7 +28,8 @@ class Parity:
 
     :param recorded: observations from an environment that both saw
     :param random: random ones
-    :param difference: of continuous actions: the largest ``|a - b| / max(1, |a|)``
+    :param difference: of continuous actions: the largest ``|a - b| / max(1, |a|, span)``, where the
+        span is half the range of an action that is squashed into it
     :param different: of discrete ones: observations for which they differ
     :param discrete: which of the two counts
     :param worst: the observation of the difference
@@ -60,17 +61,19 @@ def compare(
     recorded: Observations | None,
     random: Observations,
     discrete: bool,
+    span: NDArray[Any] | float = 0.0,
 ) -> Parity:
     """Run both policies on all observations.
 
     :param recorded: None: there are none
+    :param span: see :class:`Parity`, shape ``(actions,)``; rounding grows with it
     """
     difference, different, worst = 0.0, 0, None
     for observations in (recorded, random):
         for first in range(0, count_of(observations), BATCH):
             batch = rows_of(observations, first, first + BATCH)
             ours, theirs = (actor(batch).astype(np.float64) for actor in (model, exported))
-            apart = np.abs(ours - theirs) / np.maximum(1.0, np.abs(ours))
+            apart = np.abs(ours - theirs) / np.maximum(np.maximum(1.0, span), np.abs(ours))
             apart = np.where(np.isnan(apart), np.inf, apart).max(axis=1)
             different += int((apart > 0).sum())
             if apart.max() > difference:

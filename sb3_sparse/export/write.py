@@ -23,7 +23,7 @@ from sb3_sparse.export.artifact import (
     onnx_artifact,
     predictor,
 )
-from sb3_sparse.export.extract import check_model, graph_of
+from sb3_sparse.export.extract import check_model, graph_of, span_of
 from sb3_sparse.export.fold import fold
 from sb3_sparse.export.graph import Argmax, Graph
 from sb3_sparse.export.observations import (
@@ -119,7 +119,8 @@ def export(
         there is no C compiler to check with
     :raises CorruptStateError: if masks and weights disagree, or weights are not finite
     :raises ParityError: if it does not act as the model: continuous actions that differ by more
-        than 1e-5, relative to those above 1, or a discrete action that differs
+        than 1e-5, relative to those above 1 and to the range that they are squashed into, or a
+        discrete action that differs
     """
     if to not in FORMATS:
         raise ConfigError(f"to must be one of {', '.join(map(repr, FORMATS))}, got {to!r}")
@@ -167,9 +168,10 @@ def export(
         notes.append(f"written unchecked, as asked: {error}")
     else:
         reference = quantized(small).run if int8 else own
-        parity = compare(reference, actor, observations, random, discrete)
+        how = (observations, random, discrete, span_of(model))
+        parity = compare(reference, actor, *how)
         if int8:
-            rounding = compare(own, actor, observations, random, discrete)
+            rounding = compare(own, actor, *how)
         if not parity.holds:
             failure = _failure(parity, small)
             if not force:

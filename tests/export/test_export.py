@@ -211,6 +211,21 @@ def test_parity_by_hand():
     assert not found.holds
 
 
+def test_rounding_may_grow_with_the_range_that_actions_are_squashed_into(tmp_path):
+    wide = spaces.Box(np.float32([-1e6, -1]), np.float32([1e6, 1]))
+    for algorithm in ("SAC", "TD3"):
+        for to in ("c", "numpy", "onnx"):
+            report = export(make(algorithm, Task(VECTOR, wide)), tmp_path / "policy", to)
+            assert report.parity.holds
+    span = np.array([1e6, 1.0])
+    for off, holds in (([5.0, 0], True), ([15.0, 0], False), ([0, 5e-6], True), ([0, 2e-5], False)):
+        found = compare(
+            lambda o: np.zeros((len(o), 2)), lambda o, off=off: np.zeros((len(o), 2)) + off,
+            None, np.zeros((3, 1)), False, span,
+        )  # fmt: skip
+        assert found.holds == holds
+
+
 def test_without_a_compiler_a_c_file_is_written_only_when_forced(model, monkeypatch, tmp_path):
     monkeypatch.setenv("CC", "no-such-compiler")
     with pytest.raises(UnsupportedError, match="there is no no-such-compiler here; install gcc"):
