@@ -32,7 +32,7 @@ app.command()(enjoy)
 app.command()(inspect)
 app.command()(compress)
 app.command()(export)
-app.add_typer(tuning, name="tune")
+app.add_typer(tuning, name="tune", help="Search hyperparameters with Optuna, and report.")
 app.add_typer(studies, name="study", help="Run and report whole comparisons, as the paper's.")
 
 

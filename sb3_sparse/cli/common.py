@@ -8,6 +8,8 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
+from sb3_sparse.errors import ConfigError
+
 console = Console(highlight=False)
 INTERRUPTED = 130
 AS_CONFIG = "as the config"
@@ -19,7 +21,15 @@ def text(help: str, *names: str, shown: str | bool = True) -> Any:
 
 
 Algo = Annotated[str, text("Algorithm: dqn, sac, ppo, td3, tqc, ...")]
-Env = Annotated[str, text("Gymnasium environment id.")]
+Env = Annotated[str, text("Gymnasium environment id, or package:Id.")]
+GymPackages = Annotated[
+    list[str] | None,
+    text(
+        "Module that registers environments of your own; may be given again.",
+        "--gym-packages",
+        shown=False,
+    ),
+]
 Method = Annotated[str | None, text("dense, prune, static, set or rigl.", shown="rigl")]
 Sparsity = Annotated[float | None, text("Removed fraction, in [0, 1).", shown=AS_CONFIG)]
 Distribution = Annotated[str | None, text("erk, er or uniform.", shown="erk")]
@@ -46,7 +56,9 @@ EvalFreq = Annotated[int | None, text("Steps between two evaluations.", shown="a
 EvalEpisodes = Annotated[int | None, text("Episodes of an evaluation.", shown="as the paper")]
 Best = Annotated[bool, text("Of a run's folder, the best policy instead of the last.", "--best")]
 ModelAlgo = Annotated[str | None, text("Algorithm.", shown="as the run or the file")]
-ModelEnv = Annotated[str | None, text("Gymnasium environment id.", shown="as the run")]
+ModelEnv = Annotated[
+    str | None, text("Gymnasium environment id, or package:Id.", shown="as the run")
+]
 Statistics = Annotated[
     Path | None,
     text("Statistics saved by VecNormalize.", "--vecnormalize", shown="those of the run"),
@@ -61,3 +73,22 @@ def print_score(what: str, mean: float, std: float, path: Path) -> None:
     """A line on a policy's return."""
     score = f"{mean:.1f} ± {std:.1f}"
     console.print(f"{what:<13} [bold]{score}[/bold]  {path}", soft_wrap=True)
+
+
+def values_and_packages(
+    extra: list[str], hyperparams: list[str] | None, gym_packages: list[str] | None
+) -> tuple[list[str], list[str]]:
+    """What follows ``--hyperparams`` and ``--gym-packages``, which both take several words.
+
+    :param extra: words that no option has taken
+    :raises ConfigError: if one belongs to neither
+    """
+    values, packages = list(hyperparams or []), list(gym_packages or [])
+    for word in extra:
+        if values and (":" in word or not packages):
+            values.append(word)
+        elif packages and ":" not in word:
+            packages.append(word)
+        else:
+            raise ConfigError(f"unexpected argument {word!r}; see --help")
+    return values, packages

@@ -12,6 +12,7 @@ import typer
 from sb3_sparse.cli.common import (
     INTERRUPTED,
     Best,
+    GymPackages,
     ModelAlgo,
     ModelEnv,
     Statistics,
@@ -37,6 +38,7 @@ def compress(
         str | None, text("erk, er or uniform.", shown="a sparse model's own, else erk")
     ] = None,
     env: ModelEnv = None,
+    gym_packages: GymPackages = None,
     algo: ModelAlgo = None,
     vecnormalize: Statistics = None,
     best: Best = False,
@@ -67,7 +69,14 @@ def compress(
     from sb3_sparse.zoo.saved import find_saved
     from sb3_sparse.zoo.speed import use_few_threads
 
-    saved = find_saved(model, best=best, algo=algo, env_id=env, vecnormalize=vecnormalize)
+    saved = find_saved(
+        model,
+        best=best,
+        algo=algo,
+        env_id=env,
+        vecnormalize=vecnormalize,
+        gym_packages=gym_packages or [],
+    )
     env_id = environment_of(saved)
     folder = out or _default_folder(model, sparsity)
     training = training_envs(saved, n_envs, seed)

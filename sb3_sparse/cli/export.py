@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from sb3_sparse.cli.common import Best, ModelAlgo, ModelEnv, Statistics, console, text
+from sb3_sparse.cli.common import Best, GymPackages, ModelAlgo, ModelEnv, Statistics, console, text
 from sb3_sparse.errors import ConfigError
 
 RECORDED = 1000
@@ -26,6 +26,7 @@ def export(
     ] = False,
     best: Best = False,
     env: ModelEnv = None,
+    gym_packages: GymPackages = None,
     algo: ModelAlgo = None,
     force: Annotated[bool, text("Write also what does not act as the model.", "--force")] = False,
 ) -> None:
@@ -40,7 +41,14 @@ def export(
 
     if to not in FORMATS:
         raise ConfigError(f"--to must be one of {', '.join(FORMATS)}, got {to!r}")
-    saved = find_saved(model, best=best, algo=algo, env_id=env, vecnormalize=vecnormalize)
+    saved = find_saved(
+        model,
+        best=best,
+        algo=algo,
+        env_id=env,
+        vecnormalize=vecnormalize,
+        gym_packages=gym_packages or [],
+    )
     if to == "dense" and _as_zip(out).resolve() == saved.path.resolve():
         raise ConfigError(f"{saved.path} would be overwritten by its own export; give another name")
     loaded = saved.load()

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from sb3_sparse.cli.common import console, print_score, text
+from sb3_sparse.cli.common import GymPackages, console, print_score, text
 from sb3_sparse.zoo.inspect import inspect_model
 
 
@@ -17,11 +17,12 @@ def enjoy(
     best: Annotated[bool, text("The best policy instead of the last.", "--best")] = False,
     video: Annotated[bool, text("Record a video of the first 1000 steps.", "--video")] = False,
     seed: Annotated[int, text("Seed of the environment.")] = 0,
+    gym_packages: GymPackages = None,
 ) -> None:
     """Evaluate what a run has trained, and record a video of it."""
     from sb3_sparse.zoo.enjoy import enjoy as score_run
 
-    score = score_run(run, episodes, best, video, seed)
+    score = score_run(run, episodes, best, video, seed, gym_packages or [])
     console.print(f"Return over {score.episodes} episodes:")
     print_score(
         "Best policy:" if best else "Last policy:", score.mean_return, score.std_return, score.model

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import shlex
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.table import Table
 
-from sb3_sparse.cli.common import INTERRUPTED, Address, Launcher, console, text
+from sb3_sparse.cli.common import INTERRUPTED, Address, GymPackages, Launcher, console, text
 from sb3_sparse.cli.studyprogress import StudyProgress
 from sb3_sparse.errors import ConfigError, MissingExtra
 
@@ -52,12 +53,14 @@ def run(
     launcher: Launcher = "local",
     address: Address = None,
     store: Store = Path("studies"),
+    gym_packages: GymPackages = None,
 ) -> None:
     """Train what a study lacks. What is done stays done; the same command goes on."""
     from sb3_sparse.experiments import Study, run_study
     from sb3_sparse.launch import launcher_named
 
-    study = Study.read(name, scale)
+    packages = gym_packages or []
+    study = Study.read(name, scale, packages)
     if Path(name).suffix:
         _check_figures(study)
     runner = run_study(study, store, launcher_named(launcher, address), workers)
@@ -69,14 +72,14 @@ def run(
     except KeyboardInterrupt:
         console.print("Stopping; what is running is kept up to its last checkpoint ...")
         runner.close()
-        console.print(f"Go on with: {_command('run', name, scale, store, workers)}")
+        console.print(f"Go on with: {_command('run', name, scale, store, packages, workers)}")
         raise typer.Exit(INTERRUPTED) from None
     finally:
         shown.close()
     assert last is not None
     if last.elsewhere:
         console.print(f"{last.elsewhere} runs are trained by other processes; look again with:")
-        console.print(_command("status", name, scale, store), soft_wrap=True)
+        console.print(_command("status", name, scale, store, packages), soft_wrap=True)
     alike: dict[str, list[str]] = {}
     for failed, error in last.failed.items():
         alike.setdefault(error.rstrip(), []).append(failed)
@@ -85,18 +88,26 @@ def run(
         console.print(error, markup=False, soft_wrap=True)
     console.print(f"{last.done} of {last.planned} runs are done.")
     if last.done:
-        console.print(f"Draw them: {_command('report', name, scale, store)}", soft_wrap=True)
+        console.print(
+            f"Draw them: {_command('report', name, scale, store, packages)}", soft_wrap=True
+        )
     if last.failed:
         raise typer.Exit(1)
 
 
 @studies.command()
-def status(name: Name, scale: Scale = "small", store: Store = Path("studies")) -> None:
+def status(
+    name: Name,
+    scale: Scale = "small",
+    store: Store = Path("studies"),
+    gym_packages: GymPackages = None,
+) -> None:
     """How far a study is, and which of its runs failed."""
     from sb3_sparse.experiments import Study
     from sb3_sparse.experiments.standing import FAILED, RUNNING, STOPPED, counts
 
-    study = Study.read(name, scale)
+    packages = gym_packages or []
+    study = Study.read(name, scale, packages)
     standings = _standings(study, store)
     found = counts(standings)
     console.print(f"{study.title}, scale {scale}: {len(standings)} runs")
@@ -120,16 +131,18 @@ def report(
     out: Annotated[
         Path | None, text("Where it is written.", "--out", "-o", shown="<folder>/<name>/<scale>")
     ] = None,
+    gym_packages: GymPackages = None,
 ) -> None:
     """Figures, tables and verdicts of what is done, as one page that opens from disk."""
     from sb3_sparse.experiments import Study
     from sb3_sparse.report import write_report
 
-    study = Study.read(name, scale)
+    packages = gym_packages or []
+    study = Study.read(name, scale, packages)
     standings = _standings(study, store)
     folders = [one.folder for one in standings if one.folder.is_dir()]
     if not folders:
-        command = _command("run", name, scale, store)
+        command = _command("run", name, scale, store, packages)
         raise ConfigError(f"there is no run of this study in {store} yet; begin with: {command}")
     page = write_report(
         folders,
@@ -137,7 +150,7 @@ def report(
         title=f"{study.title} ({scale})",
         figures=study.figures,
         varies=study.varies,
-        command=_command("run", name, scale, store),
+        command=_command("run", name, scale, store, packages),
         pending=[_pending(one, store) for one in standings if one.status != "done"],
     )
     console.print(f"Written: {page}", soft_wrap=True)
@@ -163,10 +176,14 @@ def _standings(study: Study, store: Path) -> list[CellStanding]:
     return [standing_of(cell, store) for cell in study.cells]
 
 
-def _command(what: str, name: str, scale: str, store: Path, workers: int = 1) -> str:
+def _command(
+    what: str, name: str, scale: str, store: Path, packages: Sequence[str], workers: int = 1
+) -> str:
     words = ["sb3-sparse", "study", what, name, "--scale", scale]
     if store != Path("studies"):
         words += ["--folder", str(store)]
+    for package in packages:
+        words += ["--gym-packages", package]
     if workers > 1:
         words += ["--workers", str(workers)]
     return shlex.join(words)

@@ -17,6 +17,7 @@ from sb3_sparse.cli.common import (
     Envs,
     EvalEpisodes,
     EvalFreq,
+    GymPackages,
     Hyperparams,
     LogFolder,
     Method,
@@ -25,6 +26,7 @@ from sb3_sparse.cli.common import (
     console,
     print_score,
     text,
+    values_and_packages,
 )
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.zoo.progress import TrainingProgress
@@ -50,6 +52,7 @@ def train(
     n_envs: Envs = None,
     hyperparams: Hyperparams = None,
     conf_file: ConfFile = None,
+    gym_packages: GymPackages = None,
     eval_freq: EvalFreq = None,
     eval_episodes: EvalEpisodes = None,
     device: Device = "auto",
@@ -71,8 +74,7 @@ def train(
             console.print(f"Going on with {resume}", soft_wrap=True)
             outcome = engine.resume(resume, [progress])
         else:
-            if context.args and not hyperparams:
-                raise ConfigError(f"unexpected argument {context.args[0]!r}; see --help")
+            values, packages = values_and_packages(context.args, hyperparams, gym_packages)
             run = Run(
                 algo=algo.lower(),
                 env_id=env,
@@ -83,11 +85,12 @@ def train(
                 seed=seed,
                 n_timesteps=n_timesteps,
                 n_envs=n_envs,
-                hyperparams=parse_overrides([*(hyperparams or []), *context.args]),
+                hyperparams=parse_overrides(values),
                 conf_file=conf_file,
                 eval_freq=eval_freq,
                 eval_episodes=eval_episodes,
                 device=device,
+                gym_packages=tuple(packages),
             )
             console.print(_headline(run))
             outcome = engine.train(run, log_folder, [progress], tensorboard_log)

@@ -20,6 +20,7 @@ from sb3_sparse.cli.common import (
     Envs,
     EvalEpisodes,
     EvalFreq,
+    GymPackages,
     Hyperparams,
     Launcher,
     LogFolder,
@@ -28,6 +29,7 @@ from sb3_sparse.cli.common import (
     Steps,
     console,
     text,
+    values_and_packages,
 )
 from sb3_sparse.cli.tuneprogress import TuningProgress, values_in_words
 from sb3_sparse.zoo.run import Run
@@ -97,6 +99,7 @@ def search(
     n_envs: Envs = None,
     hyperparams: Hyperparams = None,
     conf_file: ConfFile = None,
+    gym_packages: GymPackages = None,
     eval_freq: EvalFreq = None,
     eval_episodes: EvalEpisodes = None,
     device: Device = "auto",
@@ -111,6 +114,7 @@ def search(
     from sb3_sparse.tuning.best import check_target
     from sb3_sparse.tuning.best import write_into as merge
 
+    values, packages = values_and_packages(context.args, hyperparams, gym_packages)
     run = Run(
         algo=algo.lower(),
         env_id=env,
@@ -120,11 +124,12 @@ def search(
         seed=seed,
         n_timesteps=n_timesteps,
         n_envs=n_envs,
-        hyperparams=parse_overrides([*(hyperparams or []), *context.args]),
+        hyperparams=parse_overrides(values),
         conf_file=conf_file,
         eval_freq=eval_freq,
         eval_episodes=eval_episodes,
         device=device,
+        gym_packages=tuple(packages),
     )
     if write_into is not None:
         check_target(run, write_into)

@@ -48,6 +48,8 @@ class Cell:
             "during": self.measures.during,
             "trained": self.trained,
         }
+        if run.gym_packages:
+            content["gym_packages"] = run.gym_packages
         text = json.dumps(content, sort_keys=True, default=_plain)
         return hashlib.sha256(text.encode()).hexdigest()[:DIGITS]
 

@@ -14,6 +14,7 @@ from sb3_sparse.experiments.cell import Cell
 from sb3_sparse.experiments.measures import Measures
 from sb3_sparse.topology import method_named, method_names
 from sb3_sparse.zoo.configs import read_yaml
+from sb3_sparse.zoo.environments import package_names
 from sb3_sparse.zoo.run import Run
 from sb3_sparse.zoo.settings import Names, find_callback
 
@@ -24,6 +25,7 @@ RUN_KEYS = {one.name for one in fields(Run)} - {"seed", "device", "entry"}
 CHOSEN = ("sparsity", "match_params", "method", "distribution", "algo")
 """What a scale chooses among a block's own values."""
 VARY, SEEDS, MEASURES, SCHEDULE = "vary", "seeds", "measures", "schedule"
+PACKAGES = "gym_packages"
 
 
 def study_names() -> list[str]:
@@ -51,11 +53,12 @@ class Study:
     cells: tuple[Cell, ...]
 
     @classmethod
-    def read(cls, what: str, scale: str) -> Study:
+    def read(cls, what: str, scale: str, gym_packages: Sequence[str] = ()) -> Study:
         """A shipped study, or one's own from a file.
 
         :param what: a name of :func:`study_names`, or the path of a YAML file (docs/studies.md)
         :param scale: which of its scales
+        :param gym_packages: modules that register environments, beside those that the file names
         :raises ConfigError: if there is no such study or scale, or something is wrong with it
         """
         path = Path(what)
@@ -81,7 +84,7 @@ class Study:
             near = did_you_mean(scale, map(str, scales)) if isinstance(scales, Mapping) else ""
             raise ConfigError(f"{path} has no scale {scale!r}{near}, only {known}")
         try:
-            cells = tuple(_cells(content, scales[scale] or {}))
+            cells = tuple(_cells(content, scales[scale] or {}, gym_packages))
         except ConfigError as error:
             raise ConfigError(f"{path}, scale {scale}: {error}") from error
         if not cells:
@@ -115,7 +118,9 @@ def check_keys(given: Any, allowed: set[str], where: str) -> None:
         )
 
 
-def _cells(content: Mapping[str, Any], of_scale: Any) -> Iterator[Cell]:
+def _cells(
+    content: Mapping[str, Any], of_scale: Any, gym_packages: Sequence[str]
+) -> Iterator[Cell]:
     """All cells of a scale, first seeds first, none twice."""
     check_keys(of_scale, RUN_KEYS | {SEEDS, MEASURES, SCHEDULE, VARY}, "a scale")
     if not isinstance(content["runs"], list):
@@ -138,7 +143,9 @@ def _cells(content: Mapping[str, Any], of_scale: Any) -> Iterator[Cell]:
         arguments
         for block in content["runs"]
         for given in _grid(_block(content.get("common", {}), block, scale))
-        for arguments in [_with_schedule(given, schedule)]
+        for known in [package_names(given.get(PACKAGES))]
+        for whole in [{**given, PACKAGES: (*known, *gym_packages)}]
+        for arguments in [_with_schedule(whole, schedule)]
     ]
     seen: set[str] = set()
     for seed in range(seeds):
@@ -253,7 +260,9 @@ def _grid(block: dict[str, Any]) -> Iterator[dict[str, Any]]:
     """Every combination of the lists in a block, and of what it varies."""
     varied = block.pop(VARY, {})
     hyperparams = block.pop("hyperparams", {})
-    lists = {key: _as_list(value) for key, value in block.items()}
+    lists = {
+        key: [value] if key == PACKAGES else _as_list(value) for key, value in block.items()
+    }
     for values in product(*lists.values()):
         for chosen in product(*varied.values()):
             yield {

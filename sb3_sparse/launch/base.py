@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib
+import pickle
+import sys
 from abc import ABC, abstractmethod
 from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass
@@ -34,6 +36,18 @@ class Task:
         """Make the call, here."""
         module, _, name = self.function.partition(":")
         return getattr(importlib.import_module(module), name)(**self.arguments)
+
+    def packed(self) -> bytes:
+        """Bytes for another process, with where this one finds its modules."""
+        return pickle.dumps((list(sys.path), pickle.dumps(self)))
+
+    @staticmethod
+    def unpacked(content: bytes) -> Task:
+        """The task of :meth:`packed`; modules are found where that process found them, too."""
+        path, task = pickle.loads(content)
+        sys.path.extend(folder for folder in path if folder not in sys.path)
+        found: Task = pickle.loads(task)
+        return found
 
 
 @dataclass(frozen=True)

@@ -10,15 +10,17 @@ import threading
 import traceback
 from pathlib import Path
 
+from sb3_sparse.launch.base import Task
+
 
 def main() -> None:
     """Do the task; stop as by SIGTERM when the process that started this one is gone."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # a KeyboardInterrupt, as Ctrl-C is
-    task = pickle.load(sys.stdin.buffer)
+    packed = pickle.load(sys.stdin.buffer)
     threading.Thread(target=_stop_at_the_end_of_input, daemon=True).start()
     value, error = None, None
     try:
-        value = task()
+        value = Task.unpacked(packed)()
     except (Exception, KeyboardInterrupt):
         error = traceback.format_exc()
         print(error, file=sys.stderr)

@@ -82,7 +82,7 @@ class _Processes:
     def _talk(self, process: subprocess.Popen[bytes], task: Task, answer: Path, log: Path) -> Ended:
         assert process.stdin is not None
         try:
-            process.stdin.write(pickle.dumps(task))
+            process.stdin.write(pickle.dumps(task.packed()))
             process.stdin.write(b"\n")
             process.stdin.flush()  # and stays open: its end tells the child that we are gone
         except BrokenPipeError:

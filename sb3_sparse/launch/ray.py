@@ -47,7 +47,7 @@ class RayLauncher(Launcher):
             while waiting or running:
                 while waiting and len(running) < workers:
                     task = waiting.pop()
-                    running[call.remote(task)] = task
+                    running[call.remote(task.packed())] = task
                 done, _ = ray.wait(list(running), timeout=EVERY)
                 for reference in done:
                     yield self._ended(reference, running.pop(reference))
@@ -93,9 +93,9 @@ def _reach(address: str) -> None:
     socket.create_connection((host, int(port)), timeout=PATIENCE).close()
 
 
-def _in_one_thread(task: Task) -> tuple[Any, str | None]:
+def _in_one_thread(task: bytes) -> tuple[Any, str | None]:
     os.environ["OMP_NUM_THREADS"] = "1"  # before the task imports torch
     try:
-        return task(), None
+        return Task.unpacked(task)(), None
     except (Exception, KeyboardInterrupt):
         return None, traceback.format_exc()

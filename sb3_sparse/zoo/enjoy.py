@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import os
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,9 +15,14 @@ from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecVideoRecorder
 
 from sb3_sparse.errors import ConfigError, MissingExtra
-from sb3_sparse.zoo.environments import is_atari, known_environment
+from sb3_sparse.zoo.environments import (
+    import_packages,
+    is_atari,
+    known_environment,
+    package_names,
+)
 from sb3_sparse.zoo.experiment import envs_of_run, load_for_prediction, quiet
-from sb3_sparse.zoo.saved import arguments_of, model_in
+from sb3_sparse.zoo.saved import arguments_of, environment_in, model_in
 
 VIDEO_STEPS = 1000
 
@@ -40,7 +46,12 @@ class Score:
 
 
 def enjoy(
-    folder: Path, episodes: int = 20, best: bool = False, video: bool = False, seed: int = 0
+    folder: Path,
+    episodes: int = 20,
+    best: bool = False,
+    video: bool = False,
+    seed: int = 0,
+    gym_packages: Sequence[str] = (),
 ) -> Score:
     """Evaluate a run's policy, deterministically (but for Atari games), as rl-zoo does.
 
@@ -49,12 +60,16 @@ def enjoy(
     :param best: the best policy instead of the last
     :param video: record the first 1000 steps in ``<folder>/videos``
     :param seed: of the environment
+    :param gym_packages: modules that register environments, beside those that the run names
     :raises ConfigError: if there is no run or no such model in it
     """
     if episodes < 1:
         raise ConfigError(f"episodes must be 1 or more, got {episodes}")
     arguments = arguments_of(folder)
-    algo, env_id = arguments["algo"], arguments["env"]
+    algo = arguments["algo"]
+    env_id, packages = environment_in(arguments)
+    assert env_id is not None
+    import_packages(package_names([*packages, *gym_packages]))
     known_environment(env_id)
     env_name = env_id.replace("/", "-")
     path = model_in(folder, env_id, best)

@@ -1,8 +1,11 @@
-"""Which environments there are, and what is missing when one is not."""
+"""Which environments there are, whose package brings one, and what is missing when one is not."""
 
 from __future__ import annotations
 
 import importlib.util
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 
@@ -19,6 +22,71 @@ def register_atari() -> bool:
     return True
 
 
+def package_names(given: Any) -> tuple[str, ...]:
+    """Names of packages that register environments, as ``--gym-packages`` and files give them.
+
+    :param given: a name, a list of names, or None
+    :raises ConfigError: if it is something else
+    """
+    names = [given] if isinstance(given, str) else [] if given is None else given
+    if not isinstance(names, (list, tuple)) or not all(_is_module(name) for name in names):
+        raise ConfigError(
+            "gym_packages must be names of modules that register environments, e.g. my_envs or "
+            f"my_envs.maze (no path of a file), got {given!r}"
+        )
+    return tuple(dict.fromkeys(names))
+
+
+def _is_module(name: Any) -> bool:
+    return isinstance(name, str) and all(part.isidentifier() for part in name.split("."))
+
+
+def plain_id(env_id: str, packages: Sequence[str] = ()) -> tuple[str, tuple[str, ...]]:
+    """An id without its package, and the packages with it.
+
+    Gymnasium's ``package:Env-v0`` is ``Env-v0`` of a package that is imported first. Folders and
+    configs know the plain id.
+
+    :param env_id: e.g. ``"CartPole-v1"`` or ``"my_envs:Maze-v0"``
+    :param packages: that are imported anyway
+    :raises ConfigError: if what stands before the colon is no name of a module
+    """
+    package, colon, name = env_id.partition(":")
+    if not colon:
+        return env_id, tuple(packages)
+    if not _is_module(package) or not name or ":" in name:
+        raise ConfigError(
+            f"the environment {env_id!r} is neither an id nor package:Id, e.g. my_envs:Maze-v0"
+        )
+    return name, package_names([*packages, package])
+
+
+def import_packages(names: Iterable[str]) -> None:
+    """Import packages, so that they register their environments.
+
+    :raises ConfigError: if one is not there, or fails
+    """
+    for name in names:
+        try:
+            importlib.import_module(name)
+        except ModuleNotFoundError as error:
+            if not error.name or not (name == error.name or name.startswith(f"{error.name}.")):
+                raise _failed(name, error) from error
+            root = Path(name.partition(".")[0])
+            here = root.is_dir() or root.with_suffix(".py").is_file()
+            raise ConfigError(
+                f"there is no package {name!r} to import environments from; install it, or put "
+                "the folder that it lies in on PYTHONPATH"
+                + (" (it lies in this one: PYTHONPATH=. before the command)" if here else "")
+            ) from error
+        except Exception as error:
+            raise _failed(name, error) from error
+
+
+def _failed(name: str, error: Exception) -> ConfigError:
+    return ConfigError(f"the package {name!r} cannot be imported: {type(error).__name__}: {error}")
+
+
 def known_environment(env_id: str) -> None:
     """Refuse an environment that is not there.
 
@@ -33,6 +101,7 @@ def known_environment(env_id: str) -> None:
         raise ConfigError(
             f"unknown environment {env_id!r}"
             + (did_you_mean(env_id, gym.registry) or "; give a Gymnasium id")
+            + "; --gym-packages names a module that registers environments of your own"
             + ("" if has_atari else " (Atari games need sb3-sparse[atari])")
         )
 

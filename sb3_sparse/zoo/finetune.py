@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import (
 
 from sb3_sparse.errors import ConfigError, MissingExtra
 from sb3_sparse.policies.saving import BROKEN_PICKLE
-from sb3_sparse.zoo.environments import is_atari, known_environment
+from sb3_sparse.zoo.environments import import_packages, is_atari, known_environment
 from sb3_sparse.zoo.experiment import quiet, saved_settings
 from sb3_sparse.zoo.saved import Saved, arguments_of, read_zip
 
@@ -70,6 +70,7 @@ def environment_of(saved: Saved) -> str:
         raise ConfigError(
             f"{saved.path} does not say what it was trained in; give --env, e.g. --env CartPole-v1"
         )
+    import_packages(saved.gym_packages)
     known_environment(saved.env_id)
     return saved.env_id
 
@@ -87,7 +88,7 @@ def write_run_files(saved: Saved, folder: Path) -> None:
     if saved.params is not None:
         arguments = arguments_of(saved.params.parent)
         settings = (saved.params / "config.yml").read_text()
-    arguments |= {"algo": saved.algo, "env": env_id}
+    arguments |= {"algo": saved.algo, "env": env_id, "gym_packages": list(saved.gym_packages)}
     (params / "args.yml").write_text(yaml.dump(arguments))
     (params / "config.yml").write_text(settings)
 

@@ -16,7 +16,13 @@ from sb3_sparse.policies.aliases import supported_algorithms
 from sb3_sparse.sparsity.distributions import check_distribution, check_sparsity
 from sb3_sparse.zoo.arguments import MAPPING, Kind, is_whole
 from sb3_sparse.zoo.configs import config_path, entry_of, evaluation_of
-from sb3_sparse.zoo.environments import is_atari, known_environment
+from sb3_sparse.zoo.environments import (
+    import_packages,
+    is_atari,
+    known_environment,
+    package_names,
+    plain_id,
+)
 from sb3_sparse.zoo.settings import apply_overrides, method_of, policy_kwargs_of
 from sb3_sparse.zoo.validation import check_settings
 
@@ -37,7 +43,7 @@ class Run:
     """One training run. What is None is as the config says.
 
     :param algo: algorithm, e.g. ``"sac"``
-    :param env_id: Gymnasium id
+    :param env_id: Gymnasium id; ``"package:Id-v0"`` becomes ``"Id-v0"`` and one more package
     :param method: ``"dense"`` or a topology method; None: as ``conf_file`` says, else RigL
     :param sparsity: removed fraction, in [0, 1)
     :param distribution: ``"erk"``, ``"er"`` or ``"uniform"``
@@ -53,6 +59,8 @@ class Run:
     :param eval_freq: environment steps between two evaluations
     :param eval_episodes: episodes of one evaluation
     :param entry: settings in place of those that the config has for the environment
+    :param gym_packages: modules that register environments when they are imported, as rl-zoo's
+        ``--gym-packages``
     :raises ConfigError: for a name or value that is not allowed
     """
 
@@ -71,6 +79,7 @@ class Run:
     eval_freq: int | None = None
     eval_episodes: int | None = None
     entry: Mapping[str, Any] | None = None
+    gym_packages: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         for one in fields(self):  # NumPy's numbers, which no JSON takes, become Python's
@@ -82,7 +91,11 @@ class Run:
                 f"are {', '.join(algorithms())} (tqc, qrdqn, crossq and trpo need "
                 "sb3-sparse[contrib])"
             )
-        known_environment(self.env_id)
+        env_id, packages = plain_id(self.env_id, package_names(self.gym_packages))
+        object.__setattr__(self, "env_id", env_id)
+        object.__setattr__(self, "gym_packages", packages)
+        import_packages(packages)
+        known_environment(env_id)
         if self.sparsity is not None:
             check_sparsity(self.sparsity)
         if self.distribution is not None:
@@ -102,6 +115,11 @@ class Run:
             optional = name in OPTIONAL and value is None
             if not optional and not kind.fits(value):
                 raise ConfigError(f"{name} must be {kind.allowed}, got {value!r}")
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Unpickle, where the environment may not be registered yet: in a worker."""
+        vars(self).update(state)
+        import_packages(self.gym_packages)
 
     @property
     def algorithm(self) -> type[BaseAlgorithm]:
@@ -175,7 +193,9 @@ class Run:
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, from which ``Run(**values)`` makes the same run."""
-        return {**asdict(self), "hyperparams": dict(self.hyperparams)}
+        values = {**asdict(self), "hyperparams": dict(self.hyperparams)}
+        packages = values.pop("gym_packages")  # named only where there are any, as in old files
+        return {**values, "gym_packages": list(packages)} if packages else values
 
 
 def plain(value: Any) -> Any:

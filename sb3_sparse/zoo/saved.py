@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_sparse.errors import ConfigError, CorruptStateError
 from sb3_sparse.policies.saving import differ
+from sb3_sparse.zoo.environments import package_names, plain_id
 from sb3_sparse.zoo.experiment import load_for_prediction, saved_settings
 from sb3_sparse.zoo.run import algorithms
 
@@ -42,6 +44,7 @@ class Saved:
     :param env_id: what it was trained in; None: not known
     :param params: folder of its run's ``config.yml`` and normalisation; None: it lies in no run
     :param vecnormalize: statistics that its observations were normalised by; None: they were not
+    :param gym_packages: modules that register its environment
     """
 
     path: Path
@@ -49,6 +52,7 @@ class Saved:
     env_id: str | None = None
     params: Path | None = None
     vecnormalize: Path | None = None
+    gym_packages: tuple[str, ...] = ()
 
     def load(self, env: VecEnv | None = None) -> BaseAlgorithm:
         """The model; without an environment it is fit for prediction only.
@@ -76,6 +80,7 @@ def find_saved(
     algo: str | None = None,
     env_id: str | None = None,
     vecnormalize: Path | None = None,
+    gym_packages: Sequence[str] = (),
 ) -> Saved:
     """Find a model and all that belongs to it.
 
@@ -85,13 +90,15 @@ def find_saved(
     :param algo: None: as the run's folder or the file says
     :param env_id: None: as the run's folder says
     :param vecnormalize: statistics of a VecNormalize; None: those in the run's folder
+    :param gym_packages: modules that register environments, beside those that the run names
     :raises ConfigError: if there is no model, or its statistics are missing
     """
     if not is_run(path):
         path = zip_path(path)
     folder = path if path.is_dir() else path.parent
     arguments = arguments_of(folder) if path.is_dir() or is_run(folder) else {}
-    env_id = env_id or arguments.get("env")
+    env_id, packages = environment_in({**arguments, "env": env_id or arguments.get("env")})
+    packages = package_names([*packages, *gym_packages])
     params = _params_of(folder, arguments["env"]) if arguments else None
     if path.is_dir():
         path = model_in(folder, arguments["env"], best)
@@ -115,7 +122,7 @@ def find_saved(
             f"there is no file {vecnormalize}; give what VecNormalize.save wrote, e.g. "
             f"{VECNORMALIZE}"
         )
-    return Saved(path, algo, env_id, params, vecnormalize)
+    return Saved(path, algo, env_id, params, vecnormalize, packages)
 
 
 def _algo(path: Path, given: str | None, known: str | None) -> str:
@@ -236,6 +243,16 @@ def arguments_of(folder: Path) -> dict[str, Any]:
     # rl-zoo writes Python objects into it
     arguments = yaml.load(files[0].read_text(), Loader=yaml.UnsafeLoader)
     return dict(arguments)
+
+
+def environment_in(arguments: Mapping[str, Any]) -> tuple[str | None, tuple[str, ...]]:
+    """The environment's plain id in a run's arguments, and the modules that register it.
+
+    :param arguments: as :func:`arguments_of` returns them
+    """
+    packages = package_names(arguments.get("gym_packages"))
+    env_id = arguments.get("env")
+    return (None, packages) if env_id is None else plain_id(str(env_id), packages)
 
 
 def is_run(folder: Path) -> bool:

@@ -43,6 +43,13 @@ def test_tasks_run_with_one_thread_each_and_return_what_they_made(launcher):
     assert len(processes) == 3
 
 
+def test_tasks_find_modules_where_this_process_finds_them(launcher, tmp_path, monkeypatch):
+    (tmp_path / "only_here.py").write_text("def answer():\n    return 42\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    (end,) = ended(launcher, [Task("here", "only_here:answer", {})])
+    assert (end.value, end.error) == (42, None)
+
+
 def test_a_killed_process_takes_no_other_task_with_it(launcher):
     tasks = [
         Task("killed", "os:abort", {}),

@@ -1,0 +1,250 @@
+"""Environments of one's own: named by their package, remembered by runs, imported by workers."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+
+import gymnasium as gym
+import pytest
+import yaml
+
+from sb3_sparse.cli.common import values_and_packages
+from sb3_sparse.compress import compress
+from sb3_sparse.errors import ConfigError
+from sb3_sparse.experiments import Study, run_study, standing_of
+from sb3_sparse.export import export
+from sb3_sparse.launch import launcher_named
+from sb3_sparse.report import write_report
+from sb3_sparse.tuning import tune
+from sb3_sparse.tuning.backend import optuna
+from sb3_sparse.tuning.spaces import Space
+from sb3_sparse.zoo.enjoy import enjoy
+from sb3_sparse.zoo.environments import import_packages, plain_id
+from sb3_sparse.zoo.finetune import evaluation_envs, training_envs, write_run_files
+from sb3_sparse.zoo.inspect import inspect_model
+from sb3_sparse.zoo.run import Run
+from sb3_sparse.zoo.saved import arguments_of, find_saved
+from sb3_sparse.zoo.train import resume, train
+
+SOURCE = """
+import gymnasium as gym
+from gymnasium.envs.classic_control import CartPoleEnv
+
+class Tiny(CartPoleEnv):
+    pass
+
+for name in ("Tiny-v0", "ours/Tiny-v0"):
+    gym.register(name, entry_point="tiny_envs:Tiny", max_episode_steps=20)
+"""
+SHORT = dict(
+    n_timesteps=200,
+    eval_freq=100,
+    eval_episodes=1,
+    hyperparams={"net_arch": [8], "learning_starts": 50, "batch_size": 16, "buffer_size": 500},
+)
+
+
+def forget() -> None:
+    """As in a new process: the package was never imported."""
+    sys.modules.pop("tiny_envs", None)
+    for name in ("Tiny-v0", "ours/Tiny-v0"):
+        gym.registry.pop(name, None)
+
+
+@pytest.fixture(scope="module")
+def package(tmp_path_factory):
+    """Folder with the package ``tiny_envs``, which is on this process's path alone."""
+    folder = tmp_path_factory.mktemp("package")
+    (folder / "tiny_envs.py").write_text(SOURCE)
+    sys.path.append(str(folder))
+    yield folder
+    sys.path.remove(str(folder))
+    forget()
+
+
+@pytest.fixture(autouse=True)
+def fresh(package):
+    forget()
+
+
+@pytest.fixture(scope="module")
+def trained(package, tmp_path_factory):
+    """Folder of a run."""
+    forget()
+    return train(Run(env_id="tiny_envs:Tiny-v0", **SHORT), tmp_path_factory.mktemp("logs")).folder
+
+
+def test_a_run_remembers_the_package_and_lies_in_a_folder_of_the_plain_id(trained):
+    assert (trained.parent.name, trained.name) == ("dqn", "Tiny-v0_1")
+    assert (trained / "Tiny-v0.zip").is_file()
+    arguments = arguments_of(trained)
+    assert (arguments["env"], arguments["gym_packages"]) == ("Tiny-v0", ["tiny_envs"])
+
+
+@pytest.mark.parametrize(
+    ("env_id", "packages", "plain"),
+    [
+        ("tiny_envs:Tiny-v0", (), "Tiny-v0"),
+        ("Tiny-v0", ("tiny_envs",), "Tiny-v0"),
+        ("Tiny-v0", "tiny_envs", "Tiny-v0"),
+        ("tiny_envs:ours/Tiny-v0", ["tiny_envs"], "ours/Tiny-v0"),
+    ],
+)
+def test_both_ways_to_name_a_package_are_one(package, env_id, packages, plain):
+    run = Run(env_id=env_id, gym_packages=packages, **SHORT)
+    assert (run.env_id, run.gym_packages) == (plain, ("tiny_envs",))
+    assert Run(**run.as_dict()) == run
+    assert "gym_packages" not in Run(**SHORT).as_dict()  # as files written before have it
+
+
+def test_a_run_that_reaches_another_process_imports_its_package_there(package):
+    run = Run(env_id="tiny_envs:Tiny-v0", **SHORT)
+    content = pickle.dumps(run)
+    forget()
+    assert pickle.loads(content) == run
+    assert "Tiny-v0" in gym.registry
+
+
+def test_a_run_is_watched_exported_and_made_sparser_by_its_folder_alone(trained, tmp_path):
+    assert enjoy(trained, episodes=2).mean_return <= 20
+    forget()
+    saved = find_saved(trained)
+    envs = evaluation_envs(saved, 1, 0)
+    export(saved.load(), tmp_path / "policy", "numpy")
+    assert (tmp_path / "policy.npz").is_file()
+    forget()
+    training = training_envs(saved, 1, 0)
+    compress(saved.load(training), envs, tmp_path / "out", sparsity=0.95, steps=100, episodes=2)
+    write_run_files(saved, tmp_path / "out")
+    assert arguments_of(tmp_path / "out")["gym_packages"] == ["tiny_envs"]
+
+
+def test_looking_into_a_model_imports_nothing(trained):
+    inspect_model(trained)
+    assert "tiny_envs" not in sys.modules
+
+
+def test_a_zip_elsewhere_takes_the_package_from_the_environments_id(trained, tmp_path):
+    elsewhere = tmp_path / "model.zip"
+    elsewhere.write_bytes((trained / "Tiny-v0.zip").read_bytes())
+    for given in (
+        dict(env_id="tiny_envs:Tiny-v0"),
+        dict(env_id="Tiny-v0", gym_packages=["tiny_envs"]),
+    ):
+        forget()
+        saved = find_saved(elsewhere, **given)
+        assert saved.env_id == "Tiny-v0"
+        evaluation_envs(saved, 1, 0).close()
+    write_run_files(saved, tmp_path / "run")
+    assert arguments_of(tmp_path / "run")["gym_packages"] == ["tiny_envs"]
+
+
+def test_an_interrupted_run_goes_on_in_a_new_process(package, tmp_path):
+    from sb3_sparse.zoo.record import write_record
+
+    folder = train(Run(env_id="tiny_envs:Tiny-v0", **SHORT), tmp_path).folder
+    write_record(folder, status="evaluating", trained=True)
+    forget()
+    assert resume(folder).finished
+
+
+def test_a_run_that_rl_zoo_made_is_watched(package, tmp_path):
+    config = {
+        "Tiny-v0": {
+            "policy": "SparsePolicy",
+            "n_timesteps": 300,
+            "learning_starts": 50,
+            "policy_kwargs": {"sparsity": 0.5, "net_arch": [8]},
+            "callback": {"sb3_sparse.SparsityCallback": {"method": "static"}},
+        }
+    }
+    (tmp_path / "config.yml").write_text(yaml.safe_dump(config))
+    command = [sys.executable, "-m", "rl_zoo3.train", "--algo", "dqn", "--env", "Tiny-v0"]
+    command += ["--gym-packages", "tiny_envs", "--conf-file", "config.yml", "--eval-freq", "-1"]
+    path = os.pathsep.join([str(package), str(Path(__file__).parents[2])])
+    environment = {**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1"}
+    subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, check=True)
+    (folder,) = (tmp_path / "logs" / "dqn").glob("Tiny-v0_*")
+    assert enjoy(folder, episodes=1).episodes == 1
+    forget()
+    evaluation_envs(find_saved(folder), 1, 0).close()
+
+
+def test_workers_of_a_tuning_import_it(package, tmp_path):
+    space = Space("s", {"gamma": optuna.distributions.CategoricalDistribution([0.9])})
+    tuned = tune(Run(env_id="tiny_envs:Tiny-v0", **SHORT), space, log_folder=tmp_path)
+    assert tuned.standing.finished, tuned.errors
+    assert tuned.study.study_name == "dqn_Tiny-v0_rigl_0.9_s"
+
+
+@pytest.mark.parametrize("named", ["by id", "in the file", "by the caller"])
+def test_studies_name_it_too(named, package, tmp_path):
+    env_id = "tiny_envs:Tiny-v0" if named == "by id" else "Tiny-v0"
+    common = {"algo": "dqn", "env_id": [env_id], **SHORT}
+    if named == "in the file":
+        common["gym_packages"] = ["tiny_envs"]
+    content = {"title": "T", "figures": ["curves"], "common": common}
+    content |= {"runs": [{"method": "dense"}], "scales": {"smoke": {}}}
+    (tmp_path / "mine.yml").write_text(yaml.safe_dump(content))
+    given = ["tiny_envs"] if named == "by the caller" else []
+    study = Study.read(str(tmp_path / "mine.yml"), "smoke", given)
+    (cell,) = study.cells
+    assert cell.run == Run(algo="dqn", env_id="tiny_envs:Tiny-v0", method="dense", **SHORT)
+    if named == "in the file":
+        *_, last = run_study(study, tmp_path / "store", launcher_named("local"), 1)
+        assert (last.done, last.failed) == (1, {})
+        forget()
+        folders = [standing_of(cell, tmp_path / "store").folder]
+        assert write_report(folders, tmp_path / "out", title="T", figures=["curves"]).is_file()
+
+
+@pytest.mark.parametrize(
+    ("env_id", "message"),
+    [
+        ("nowhere_envs:Tiny-v0", "there is no package 'nowhere_envs' .* PYTHONPATH"),
+        ("broken_envs:Tiny-v0", "'broken_envs' cannot be imported: RuntimeError: no licence"),
+        ("needy_envs:Tiny-v0", "'needy_envs' cannot be imported: ModuleNotFoundError: .*'absent'"),
+        ("a/b.py:Tiny-v0", "'a/b.py:Tiny-v0' is neither an id nor package:Id"),
+        ("tiny_envs:", "is neither an id nor package:Id"),
+        ("tiny_envs:a:b", "is neither an id nor package:Id"),
+        ("tiny_envs:Tinny-v0", "unknown environment 'Tinny-v0'.*did you mean 'Tiny-v0'"),
+        ("Tiny-v0", "unknown environment 'Tiny-v0'.*--gym-packages names a module"),
+    ],
+)
+def test_what_is_wrong_with_a_package_is_said(env_id, message, package):
+    (package / "broken_envs.py").write_text("raise RuntimeError('no licence')")
+    (package / "needy_envs.py").write_text("import absent")
+    with pytest.raises(ConfigError, match=message):
+        Run(env_id=env_id)
+
+
+@pytest.mark.parametrize("given", [3, ["a.py/b"], ["my envs"], [3], {"a": 1}])
+def test_packages_that_are_no_names_of_modules_are_refused(given):
+    with pytest.raises(ConfigError, match="gym_packages must be names of modules"):
+        Run(gym_packages=given)
+
+
+def test_a_package_in_this_folder_is_found_by_saying_so(tmp_path, monkeypatch):
+    (tmp_path / "here_envs.py").touch()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [one for one in sys.path if one not in ("", str(tmp_path))])
+    with pytest.raises(ConfigError, match="PYTHONPATH=. before the command"):
+        import_packages(["here_envs"])
+
+
+def test_ids_without_a_package_stay_as_they_are():
+    assert plain_id("ALE/Pong-v5") == ("ALE/Pong-v5", ())
+
+
+def test_several_words_follow_gym_packages_and_hyperparams_in_any_order():
+    words = ["b:2", "two_envs", "c:3"]
+    values, packages = values_and_packages(words, ["a:1"], ["one_envs"])
+    assert values == ["a:1", "b:2", "c:3"]
+    assert packages == ["one_envs", "two_envs"]
+    for extra, values, packages in ((["x"], [], []), (["a:1"], [], ["one_envs"])):
+        with pytest.raises(ConfigError, match="unexpected argument"):
+            values_and_packages(extra, values, packages)
