@@ -260,9 +260,7 @@ def _grid(block: dict[str, Any]) -> Iterator[dict[str, Any]]:
     """Every combination of the lists in a block, and of what it varies."""
     varied = block.pop(VARY, {})
     hyperparams = block.pop("hyperparams", {})
-    lists = {
-        key: [value] if key == PACKAGES else _as_list(value) for key, value in block.items()
-    }
+    lists = {key: [value] if key == PACKAGES else _as_list(value) for key, value in block.items()}
     for values in product(*lists.values()):
         for chosen in product(*varied.values()):
             yield {

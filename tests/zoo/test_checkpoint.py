@@ -72,7 +72,7 @@ def test_a_damaged_file_of_a_checkpoint_costs_nothing_of_the_run(name, folder):
     (folder / "best_model.zip").write_bytes(b"better than the checkpoint's")
     before = content(folder)
     assert {"0.monitor.csv", "evaluations.npz"} <= {path.name for path in before}
-    with pytest.raises(ConfigError, match="nothing was changed"):
+    with pytest.raises(ConfigError, match="nothing was changed|is not whole"):
         resume(folder)
     assert content(folder) == before
     damaged.write_bytes(whole)
