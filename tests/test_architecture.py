@@ -17,7 +17,7 @@ FLOORS = [
     {"zoo", "analysis", "export", "compress", "launch"},
     {"callback"},
     {"policies"},
-    {"networks", "wrappers"},
+    {"networks", "wrappers", "loading"},
     {"engine"},
     {"topology"},
     {"sparsity"},

@@ -94,7 +94,9 @@ def test_a_lone_zip_needs_its_environment_and_statistics(run, tmp_path):
         sb3_sparse("compress", plain)
     with pytest.raises(ConfigError, match="did you mean 'CartPole-v1'"):
         sb3_sparse("compress", plain, "--env", "CartPool-v1")
-    with pytest.raises(ConfigError, match="cannot be loaded as a model of ppo: Observation spaces"):
+    with pytest.raises(
+        ConfigError, match="does not suit Pendulum-v1: Observation spaces do not match"
+    ):
         sb3_sparse("compress", plain, "--env", "Pendulum-v1")
     sb3_sparse("compress", plain, "--env", "CartPole-v1", "--sparsity", "0.4", *QUICK)
     assert "Return over 2" in sb3_sparse("enjoy", tmp_path / "plain-compressed-0.4", "-n", "2")

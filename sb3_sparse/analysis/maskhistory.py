@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from sb3_sparse.engine.network import SparseNetwork
 from sb3_sparse.errors import CorruptStateError
+from sb3_sparse.loading.arrays import read_arrays
+from sb3_sparse.loading.guard import reading
 
 NEVER = 2**32 - 1
 """Time at which a connection that never was active became so."""
@@ -83,13 +85,13 @@ class MaskHistory:
         new.replace(self.path)
 
     def _load(self, path: Path, timesteps: int) -> None:
-        with np.load(path) as saved:
-            sizes = {f"first/{layer.name}": layer.size for layer in self._layers()}
-            found = {name: saved[name].size for name in saved.files if name.startswith("first/")}
-            if found != sizes:
-                raise CorruptStateError(
-                    f"{path} is of a policy with other layers; remove it, or give another path"
-                )
+        what, cure = "history of masks", "remove it, or give another path"
+        saved = read_arrays(path, what, cure)
+        sizes = {f"first/{layer.name}": layer.size for layer in self._layers()}
+        found = {name: array.size for name, array in saved.items() if name.startswith("first/")}
+        if found != sizes:
+            raise CorruptStateError(f"{path} is of a policy with other layers; {cure}")
+        with reading(path, what, cure):
             ahead = int(saved["timesteps"]) > timesteps
             for layer in self._layers():
                 first = saved[f"first/{layer.name}"].astype(np.uint32)

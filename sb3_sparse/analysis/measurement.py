@@ -12,6 +12,8 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_sparse.analysis.batches import has_batch
 from sb3_sparse.errors import ConfigError, CorruptStateError
+from sb3_sparse.loading.guard import reading
+from sb3_sparse.loading.text import read_text
 
 HEADS = ("timesteps", "name", "value")
 
@@ -41,9 +43,10 @@ class MeasurementFile:
         new.replace(self.path)
 
     def _rows(self) -> list[list[str]]:
-        text = self.path.read_text()
+        text = read_text(self.path, "file of measurements", "give another path, or remove it")
         whole = text[: text.rfind("\n") + 1]  # a killed process may leave half a line
-        head, *rows = list(csv.reader(whole.splitlines())) or [list(HEADS)]
+        with reading(self.path, "file of measurements", "give another path, or remove it"):
+            head, *rows = list(csv.reader(whole.splitlines())) or [list(HEADS)]
         if tuple(head) != HEADS or any(len(r) != 3 or not r[0].isdigit() for r in rows):
             raise CorruptStateError(
                 f"{self.path} is no file of measurements with columns {', '.join(HEADS)}; give "

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -18,13 +19,13 @@ from stable_baselines3.common.vec_env import (
     VecEnv,
     VecFrameStack,
     VecMonitor,
-    VecNormalize,
     is_vecenv_wrapped,
     unwrap_vec_normalize,
 )
 
 from sb3_sparse.analysis.batches import own_randomness
 from sb3_sparse.errors import ConfigError
+from sb3_sparse.loading.statistics import load_statistics
 from sb3_sparse.wrappers import ObservationNoise, PixelNoise
 
 Wrap = Callable[[gym.Env[Any, Any]], gym.Env[Any, Any]]
@@ -183,8 +184,7 @@ def noisy_vec_env(
         env_id, n_envs=n_envs, seed=seed, wrapper_class=noisy, env_kwargs=env_kwargs
     )
     if normalize is not None:
-        envs = VecNormalize.load(normalize, envs)
-        assert isinstance(envs, VecNormalize)
+        envs = load_statistics(Path(normalize), envs)
         envs.training = envs.norm_reward = False
     return VecFrameStack(envs, frame_stack) if frame_stack else envs
 

@@ -7,26 +7,49 @@ from typing import Annotated
 
 import typer
 
-from sb3_sparse.cli.common import GymPackages, console, print_score, text
+from sb3_sparse.cli.common import (
+    Best,
+    GymPackages,
+    ModelAlgo,
+    ModelEnv,
+    Statistics,
+    console,
+    print_score,
+    text,
+)
 from sb3_sparse.zoo.inspect import inspect_model
 
 
 def enjoy(
-    run: Annotated[Path, typer.Argument(help="A run's folder, e.g. logs/dqn/CartPole-v1_1.")],
+    model: Annotated[Path, typer.Argument(help="A run's folder, or a zip saved by SB3.")],
     episodes: Annotated[int, text("How many episodes.", "--episodes", "-n")] = 20,
-    best: Annotated[bool, text("The best policy instead of the last.", "--best")] = False,
+    best: Best = False,
     video: Annotated[bool, text("Record a video of the first 1000 steps.", "--video")] = False,
     seed: Annotated[int, text("Seed of the environment.")] = 0,
+    env: ModelEnv = None,
+    algo: ModelAlgo = None,
+    vecnormalize: Statistics = None,
     gym_packages: GymPackages = None,
 ) -> None:
-    """Evaluate what a run has trained, and record a video of it."""
+    """Evaluate a saved policy, and record a video of it."""
     from sb3_sparse.zoo.enjoy import enjoy as score_run
 
-    score = score_run(run, episodes, best, video, seed, gym_packages or [])
-    console.print(f"Return over {score.episodes} episodes:")
-    print_score(
-        "Best policy:" if best else "Last policy:", score.mean_return, score.std_return, score.model
+    score = score_run(
+        model,
+        episodes,
+        best,
+        video,
+        seed,
+        gym_packages or [],
+        algo=algo,
+        env_id=env,
+        vecnormalize=vecnormalize,
     )
+    console.print(f"Return over {score.episodes} episodes:")
+    what = "Best policy:" if score.model.name == "best_model.zip" else "Last policy:"
+    if not model.is_dir():
+        what = "Policy:"
+    print_score(what, score.mean_return, score.std_return, score.model)
     for path in score.videos:
         console.print(f"Video: {path}", soft_wrap=True)
 

@@ -119,8 +119,8 @@ def status(
         if one.status in (RUNNING, STOPPED):
             console.print(f"{one.status}: {one.cell.name}, {one.steps} steps", markup=False)
         if one.status == FAILED:
-            where = one.cell.errors(store)
-            console.print(f"failed: {one.cell.name}; see {where}", markup=False, soft_wrap=True)
+            why = one.reason or f"see {one.cell.errors(store)}"
+            console.print(f"failed: {one.cell.name}; {why}", markup=False, soft_wrap=True)
 
 
 @studies.command()
@@ -166,7 +166,8 @@ def _check_figures(study: Study) -> None:
 
 
 def _pending(one: CellStanding, store: Path) -> str:
-    failed = f": failed, see {one.cell.errors(store)}" if one.status == "failed" else ""
+    why = one.reason or f"see {one.cell.errors(store)}"
+    failed = f": failed, {why}" if one.status == "failed" else ""
     return f"{one.cell.name}{failed}"
 
 

@@ -17,6 +17,8 @@ from sb3_sparse.compress.finetune import fill_buffer, fine_tune
 from sb3_sparse.compress.twin import load_beside, sparse_policy, sparsify, sparsity_of
 from sb3_sparse.engine.network import SparseNetwork
 from sb3_sparse.errors import CorruptStateError
+from sb3_sparse.loading.guard import reading
+from sb3_sparse.loading.statistics import load_statistics
 
 LEVELS = "levels"
 VECNORMALIZE = "vecnormalize.pkl"
@@ -88,10 +90,11 @@ class Bench:
         path = self._path(number)
         if not path.is_file():
             raise CorruptStateError(f"{path} is missing; remove {self.folder} and begin anew")
-        self.candidate = self.accepted = load_beside(self.model, path)
+        with reading(path, "level of a compression", f"remove {self.folder} and begin anew"):
+            self.candidate = self.accepted = load_beside(self.model, path)
         normalize = self.model.get_vec_normalize_env()
         if normalize is not None:
-            saved = VecNormalize.load(str(path.with_suffix(".pkl")), normalize.venv)
+            saved = load_statistics(path.with_suffix(".pkl"), normalize.venv)
             self._kept = _statistics_of(saved)
 
     def make(self, number: int, sparsity: float) -> int:

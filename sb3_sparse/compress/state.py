@@ -14,6 +14,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from sb3_sparse.compress.guard import Interval
 from sb3_sparse.compress.search import Level
 from sb3_sparse.errors import ConfigError, CorruptStateError
+from sb3_sparse.loading.guard import reading
+from sb3_sparse.loading.text import read_json
 from sb3_sparse.policies.compiled import unwrapped
 
 NAME = "compress.json"
@@ -58,8 +60,9 @@ def open_state(folder: Path, settings: dict[str, Any]) -> State:
     path = folder / NAME
     if not path.is_file():
         return State(settings)
-    try:
-        content = json.loads(path.read_text())
+    cure = "remove the folder and begin anew"
+    content = read_json(path, "record of a compression", cure)
+    with reading(path, "record of a compression", cure):
         state = State(
             settings=content["settings"],
             baseline={int(batch): found for batch, found in content["baseline"].items()},
@@ -67,10 +70,8 @@ def open_state(folder: Path, settings: dict[str, Any]) -> State:
             checked=content["checked"],
             finished=content["finished"],
         )
-    except (KeyError, TypeError, ValueError) as error:
-        raise CorruptStateError(
-            f"{path} is damaged ({type(error).__name__}: {error}); remove the folder and begin anew"
-        ) from error
+        if not isinstance(state.settings, dict):
+            raise CorruptStateError(f"{path} is damaged: settings are no mapping; {cure}")
     others = {
         name: (state.settings.get(name), settings.get(name))
         for name in {**state.settings, **settings}

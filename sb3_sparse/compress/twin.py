@@ -17,6 +17,7 @@ from stable_baselines3.common.save_util import save_to_zip_file
 
 from sb3_sparse.engine.masked import MaskedLayer
 from sb3_sparse.errors import ConfigError, UnsupportedError
+from sb3_sparse.loading.zips import check_finite
 from sb3_sparse.policies.aliases import supported_algorithms
 from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.policies.mixin import SparsePolicyMixin
@@ -58,11 +59,13 @@ def sparsify(
     :raises ConfigError: for a value that is not allowed, or if a layer would need more connections
         than it has
     :raises UnsupportedError: for another algorithm or a policy class that has no sparse counterpart
+    :raises Diverged: if the model's network is not finite
 
     Source: magnitude pruning, arXiv:1506.02626; shared out by layer as arXiv:1911.11134, section 3.
     """
     policy_class = _sparse_class(model)
     data, params, variables = parts_of(model)
+    check_finite(params["policy"], "the model")
     given = {"distribution": distribution, "dense_layers": dense_layers, "compute": compute}
     data["policy_class"] = policy_class
     data["policy_kwargs"] = {

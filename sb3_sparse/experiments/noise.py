@@ -11,16 +11,14 @@ from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_sparse.analysis import feature_std
-from sb3_sparse.zoo.experiment import envs_of_run, load_for_prediction, quiet
-from sb3_sparse.zoo.saved import model_in
+from sb3_sparse.zoo.finetune import envs_of
+from sb3_sparse.zoo.saved import find_saved
 
 NOISE_ENVS = 10
 SEED = 30_000
 
 
-def noisy_envs(
-    folder: Path, env_id: str, algo: str
-) -> tuple[BaseAlgorithm, Callable[[float], VecEnv]]:
+def noisy_envs(folder: Path) -> tuple[BaseAlgorithm, Callable[[float], VecEnv]]:
     """The last policy of a run, and what makes ten of its environments with noise.
 
     Pixels get ``round(N(0, sigma))`` before stacking; features of vectors ``N(0, sigma * std)``
@@ -28,12 +26,11 @@ def noisy_envs(
 
     :param folder: of a finished run
     """
-    model = load_for_prediction(algo, model_in(folder, env_id, best=False))
-    params = folder / env_id.replace("/", "-")
+    saved = find_saved(folder)
+    model = saved.load()
 
     def make(wrappers: list[dict[str, Any]]) -> VecEnv:
-        with quiet():
-            return envs_of_run(env_id, params, {}, SEED, NOISE_ENVS, wrappers)
+        return envs_of(saved, NOISE_ENVS, SEED, wrappers=wrappers)
 
     if is_image_space(model.observation_space):
         return model, lambda sigma: make([{"sb3_sparse.wrappers.PixelNoise": {"sigma": sigma}}])

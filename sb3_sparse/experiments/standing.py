@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from sb3_sparse.errors import SparsityError
 from sb3_sparse.experiments.cell import Cell
+from sb3_sparse.loading.guard import reading
 from sb3_sparse.zoo.checkpoint import is_locked
-from sb3_sparse.zoo.record import NAME, read_record
+from sb3_sparse.zoo.record import CURE, NAME, WHAT, read_record
 
 DONE, RUNNING, STOPPED, FAILED, WAITING = "done", "running", "stopped", "failed", "waiting"
 OVER = {True: "finished", False: "counted"}
@@ -24,29 +27,36 @@ class CellStanding:
     :param status: ``"done"``, ``"running"`` (some process trains it now), ``"stopped"`` (it goes on
         from its last checkpoint), ``"failed"`` or ``"waiting"``
     :param steps: environment steps done
+    :param reason: what is wrong with its record; None: nothing, or it failed in training
     """
 
     cell: Cell
     folder: Path
     status: str
     steps: int = 0
+    reason: str | None = None
 
 
 def standing_of(cell: Cell, store: Path) -> CellStanding:
     """How far a cell is.
 
     :param store: folder of the studies' runs
-    :raises ConfigError: if its record is damaged
     """
     folder = cell.folder(store)
     failed, running = cell.errors(store).is_file(), is_locked(folder)
     if not (folder / NAME).is_file():
         return CellStanding(cell, folder, RUNNING if running else FAILED if failed else WAITING)
-    record = read_record(folder)
-    steps = int(record.get("num_timesteps", 0))
+    try:
+        record = read_record(folder)
+        with reading(folder / NAME, WHAT, CURE):
+            steps = int(record.get("num_timesteps", 0))
+            missing = cell.measures.missing(record)
+    except SparsityError as error:  # one damaged record hides no other cell
+        told = str(error).replace(f"{store}{os.sep}", "")  # pages name no path of a machine
+        return CellStanding(cell, folder, FAILED, reason=told)
     if running:
         return CellStanding(cell, folder, RUNNING, steps)
-    if record["status"] == OVER[cell.trained] and not cell.measures.missing(record):
+    if record["status"] == OVER[cell.trained] and not missing:
         return CellStanding(cell, folder, DONE, steps)
     return CellStanding(cell, folder, FAILED if failed else STOPPED, steps)
 

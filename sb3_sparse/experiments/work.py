@@ -92,7 +92,7 @@ def _measure_noise(folder: Path, run: Run, arguments: Mapping[str, Any]) -> None
     from sb3_sparse.experiments.noise import noisy_envs
     from sb3_sparse.zoo.environments import is_atari
 
-    model, envs = noisy_envs(folder, run.env_id, run.algo)
+    model, envs = noisy_envs(folder)
     table = noise_robustness(model, envs, **arguments, deterministic=not is_atari(run.env_id))
     path = folder / FILES["noise"]
     new = path.with_suffix(".new")

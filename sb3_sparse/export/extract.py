@@ -24,6 +24,7 @@ from sb3_sparse.export.graph import (
     Positive,
 )
 from sb3_sparse.export.trace import Tracer
+from sb3_sparse.loading.zips import check_finite
 from sb3_sparse.policies.aliases import supported_algorithms
 from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.policies.mixin import SparsePolicyMixin
@@ -94,7 +95,8 @@ def check_model(model: BaseAlgorithm) -> None:
     """Refuse a model that nothing good can come of.
 
     :raises UnsupportedError: for an algorithm that is not supported
-    :raises CorruptStateError: if a weight is not finite, or is not 0 where its mask has nothing
+    :raises Diverged: if a weight is not finite
+    :raises CorruptStateError: if a weight is not 0 where its mask has nothing
     """
     supported = supported_algorithms()
     if not isinstance(model, tuple(supported.values())):
@@ -103,12 +105,7 @@ def check_model(model: BaseAlgorithm) -> None:
             f"{', '.join(supported)}"
         )
     policy = unwrapped(model.policy)
-    for name, tensor in policy.state_dict().items():
-        if tensor.is_floating_point() and not bool(tensor.isfinite().all()):
-            raise CorruptStateError(
-                f"{name} has values that are not finite, as after a training that diverged; "
-                "export an earlier checkpoint, e.g. best_model.zip"
-            )
+    check_finite(policy.state_dict(), "the model")
     if not isinstance(policy, SparsePolicyMixin):
         return
     for layer in policy.sparse.layers:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 import tempfile
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -35,8 +34,9 @@ from sb3_sparse.export.observations import (
 from sb3_sparse.export.parity import TOLERANCE, Parity, ParityError, compare
 from sb3_sparse.export.quantize import quantized
 from sb3_sparse.export.units import remove_dead_units, units_of
+from sb3_sparse.loading.statistics import read_statistics
 from sb3_sparse.policies.compiled import unwrapped
-from sb3_sparse.policies.saving import BROKEN_PICKLE, was_normalised
+from sb3_sparse.policies.saving import was_normalised
 
 FORMATS = ("c", "numpy", "onnx", "dense")
 RANDOM = 1000
@@ -210,7 +210,7 @@ def normalization_of(
                 "normalised rewards alone"
             )
     elif isinstance(given, (str, Path)):
-        given = _read_normalization(Path(given))
+        given = read_statistics(Path(given))
     elif not isinstance(given, VecNormalize):
         raise ConfigError(f"vecnormalize must be a VecNormalize or its file, got {given!r}")
     return given if given is not None and given.norm_obs else None
@@ -229,19 +229,6 @@ def check_statistics(model: BaseAlgorithm, normalization: VecNormalize) -> None:
             "run; if its frames were stacked after normalisation, it can be exported as 'dense' "
             "only, since no raw observation stands for the empty frames of a beginning"
         )
-
-
-def _read_normalization(path: Path) -> VecNormalize:
-    try:
-        with path.open("rb") as file:
-            found = pickle.load(file)
-    except (OSError, *BROKEN_PICKLE) as error:
-        raise ConfigError(
-            f"{path} cannot be read as statistics of a VecNormalize: {error}"
-        ) from error
-    if not isinstance(found, VecNormalize):
-        raise ConfigError(f"{path} holds {type(found).__name__}; give what VecNormalize.save wrote")
-    return found
 
 
 def _connections(model: BaseAlgorithm) -> int:

@@ -29,7 +29,7 @@ class LayerReport:
     :param nnz: active connections
     :param parameters: nnz and biases
     :param flops: of one forward pass at batch 1: multiply-adds count 2, biases and activations 1
-    :param dense_flops: the same for the dense layer
+    :param dense_flops: the same for the dense layer; 0: not known, and neither are ``flops``
     :param in_budget: False for a layer left dense by ``dense_layers``
     """
 
@@ -62,7 +62,8 @@ class SparsityReport:
     def sparsity(self, network: str | None = None) -> float:
         """Removed fraction of the kernels within the budget, of one network or of all."""
         layers = [r for r in self.layers if r.in_budget and network in (None, r.network)]
-        return 1.0 - sum(r.nnz for r in layers) / sum(r.size for r in layers)
+        size = sum(r.size for r in layers)
+        return 1.0 - sum(r.nnz for r in layers) / size if size else 0.0
 
     @property
     def nnz(self) -> int:
@@ -82,15 +83,15 @@ class SparsityReport:
                 "x".join(map(str, r.shape)),
                 f"{r.nnz:,}",
                 f"{r.density:.4f}" if r.in_budget else "dense",
-                f"{r.flops:,}",
-                f"{r.flops / r.dense_flops:.3f}",
+                *_costs(r.flops, r.dense_flops),
             )
             for r in self.layers
         ]
         flops, dense = (sum(getattr(r, k) for r in self.layers) for k in ("flops", "dense_flops"))
         size = sum(r.size for r in self.layers)
-        total = ("total", "", f"{self.nnz:,}", f"{self.nnz / size:.4f}", f"{flops:,}")
-        rows.append((*total, f"{flops / dense:.3f}"))
+        known = all(r.dense_flops for r in self.layers)
+        total = ("total", "", f"{self.nnz:,}", f"{self.nnz / size:.4f}")
+        rows.append((*total, *_costs(flops, dense if known else 0)))
         widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
         lines = [
             "  ".join(
@@ -108,6 +109,11 @@ class SparsityReport:
                 f"parameters: {self.parameters:,} (active connections and biases)",
             ]
         )
+
+
+def _costs(flops: int, dense_flops: int) -> tuple[str, str]:
+    """FLOPs and their share of the dense ones; question marks where these are not known."""
+    return (f"{flops:,}", f"{flops / dense_flops:.3f}") if dense_flops else ("?", "?")
 
 
 def report_on(policy: SparsePolicyMixin) -> SparsityReport:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import pickle
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -16,19 +15,6 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from sb3_sparse.policies.compiled import plain_names
 
 Algorithm = TypeVar("Algorithm", bound=BaseAlgorithm)
-
-BROKEN_PICKLE = (
-    pickle.UnpicklingError,
-    EOFError,
-    ImportError,
-    AttributeError,
-    AssertionError,
-    ValueError,
-    IndexError,
-    TypeError,
-    KeyError,
-)
-"""What loading something else than a pickle of ours may raise."""
 
 
 def parts_of(model: BaseAlgorithm) -> tuple[dict[str, Any], dict[str, Any], Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-import zipfile
+import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -14,11 +14,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sb3_sparse.errors import ConfigError
+from sb3_sparse.errors import ConfigError, CorruptStateError, SparsityError
+from sb3_sparse.loading.arrays import read_arrays
+from sb3_sparse.loading.guard import reading
 from sb3_sparse.report.measured import Rows, read_rows
 from sb3_sparse.report.methods import DENSE, EQUAL
-from sb3_sparse.report.settings import WIDTHS, callback_of, family_of, variant_of
-from sb3_sparse.zoo.record import NAME, read_record
+from sb3_sparse.report.settings import WIDTHS, callback_of, family_of, overrides_of, variant_of
+from sb3_sparse.zoo.record import CURE, NAME, WHAT, read_record
 from sb3_sparse.zoo.results import score_of
 
 Array = npt.NDArray[np.float64]
@@ -176,8 +178,8 @@ def read_runs(folders: Iterable[Path | str]) -> tuple[list[RunData], list[LeftOu
     for folder in sorted({Path(folder) for folder in folders}):
         try:
             run, remarks = _read(folder)
-        except ConfigError as error:
-            out.append(LeftOut(folder, str(error)))
+        except SparsityError as error:
+            out.append(LeftOut(folder, str(error).replace(f"{folder}{os.sep}", "")))
             continue
         same = first.setdefault(_identity(run), folder)
         if same != folder:
@@ -191,12 +193,10 @@ def read_runs(folders: Iterable[Path | str]) -> tuple[list[RunData], list[LeftOu
 def _read(folder: Path) -> tuple[RunData, list[str]]:
     if not folder.is_dir():
         raise ConfigError("missing: there is no such folder")
-    try:
-        record = read_record(folder)
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{NAME} cannot be read: {error}") from error
-    _check(record)
-    _check_reached(record)
+    record = read_record(folder)
+    with reading(folder / NAME, WHAT, CURE):
+        _check(record)
+        _check_reached(record)
     empty = np.zeros(0)
     timesteps, returns = empty, empty
     if record["status"] == FINISHED:
@@ -206,15 +206,16 @@ def _read(folder: Path) -> tuple[RunData, list[str]]:
         if (folder / name).is_file():
             try:
                 measured[name] = read_rows(folder / name, columns)
-            except ConfigError as error:
+            except SparsityError as error:
                 remarks.append(f"only its {name}: {error}; all else of the run is in")
-    return RunData(folder, record, timesteps, returns, measured), remarks
+    run = RunData(folder, record, timesteps, returns, measured)
+    with reading(folder / NAME, WHAT, CURE):
+        _try_out(run)
+    return run, remarks
 
 
-def _check(record: Any) -> None:
+def _check(record: Mapping[str, Any]) -> None:
     """A record that all figures can rely on."""
-    if not isinstance(record, dict):
-        raise ConfigError(f"{NAME} is damaged: it holds no mapping")
     status = record.get("status")
     if status == "failed":
         raise ConfigError(f"failed: {record.get('error') or 'no reason is recorded'}")
@@ -253,16 +254,29 @@ def _check_reached(record: Mapping[str, Any]) -> None:
         )
 
 
+def _try_out(run: RunData) -> None:
+    """Ask a run everything that a report will, so that a wrong type comes out here."""
+    numbers = [run.seed, run.steps, run.level, run.parameters, run.connections, run.flops]
+    numbers += [run.dense_flops, run.actor_share or 0.0, run.score if run.trained else 0.0]
+    if not all(map(math.isfinite, numbers)):
+        raise CorruptStateError(f"{run.folder / NAME} is damaged: a number in it is not finite")
+    names = (run.algo, run.env_id, run.family, run.label)
+    for layer in run.layers:
+        if not all(type(size) is int and size > 0 for size in layer["shape"]):
+            raise CorruptStateError(
+                f"{run.folder / NAME} is damaged: {layer['name']} has shape {layer['shape']!r}"
+            )
+    _identity(run), run.variant(), overrides_of(run.record["run"]), names
+
+
 def _evaluations(path: Path) -> tuple[Array, Array]:
     if not path.is_file():
         raise ConfigError(f"{path.name} is missing")
-    try:
-        with np.load(path) as content:
-            timesteps = np.asarray(content["timesteps"], dtype=np.float64)
-            results = np.asarray(content["results"], dtype=np.float64)
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        raise ConfigError(f"{path.name} is damaged: {error}") from error
-    if results.ndim != 2 or results.size == 0 or len(results) != len(timesteps):
+    cure = "restore it from a copy, or train anew"
+    content = read_arrays(path, "file of evaluations", cure, ("timesteps", "results"))
+    timesteps = content["timesteps"].astype(np.float64)
+    results = content["results"].astype(np.float64)
+    if results.ndim != 2 or results.size == 0 or timesteps.shape != results.shape[:1]:
         raise ConfigError(
             f"{path.name} is damaged: results of shape {results.shape} for "
             f"{len(timesteps)} evaluations"

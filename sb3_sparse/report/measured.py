@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import csv
+import io
 import math
 from collections.abc import Sequence
 from pathlib import Path
 
 from sb3_sparse.errors import ConfigError
+from sb3_sparse.loading.guard import reading
+from sb3_sparse.loading.text import read_text
 
 Rows = tuple[dict[str, str], ...]
 TEXT = "name"
@@ -16,15 +19,15 @@ TEXT = "name"
 def read_rows(path: Path, columns: Sequence[str]) -> Rows:
     """Rows of a CSV file that has at least these columns.
 
-    :raises ConfigError: if it is damaged: columns that are missing, or a cell that is no number
+    :raises ConfigError: if a column is missing, or a cell is no number
+    :raises CorruptStateError: if it is no text
     """
-    try:
-        with path.open(newline="") as file:
-            reader = csv.DictReader(file)
-            rows = tuple(reader)
-            heads = reader.fieldnames or ()
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise ConfigError(f"{path.name} is damaged: {error}") from error
+    cure = "remove it, or measure anew"
+    text = read_text(path, "file of measurements", cure)
+    with reading(path, "file of measurements", cure):
+        reader = csv.DictReader(io.StringIO(text, newline=""))
+        rows = tuple(reader)
+        heads = reader.fieldnames or ()
     absent = [name for name in columns if name not in heads]
     if absent:
         raise ConfigError(f"{path.name} is damaged: it has no column {', '.join(absent)}")

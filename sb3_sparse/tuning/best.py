@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from sb3_sparse.errors import ConfigError
+from sb3_sparse.loading.text import read_text
 from sb3_sparse.tuning.backend import FrozenTrial, optuna
 from sb3_sparse.tuning.objective import VALUES
 from sb3_sparse.tuning.spaces import with_values
@@ -97,12 +98,11 @@ def write_into(study: optuna.Study, path: Path) -> None:
     text = merge_entry(_read(path), run.env_id, settings, describe_best(study), TUNED, str(path))
     target = path.resolve()  # behind a link
     new = target.with_name(f"{target.name}.new")
-    new.write_text(text, newline="")
+    new.write_text(text, newline="", encoding="utf-8")
     shutil.copymode(target, new)
     new.replace(target)
 
 
 def _read(path: Path) -> str:
     """A file's text with its own line endings."""
-    with path.open(newline="") as file:
-        return file.read()
+    return read_text(path, "config", "name the config of that method")

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from sb3_sparse.errors import ConfigError
+from sb3_sparse.loading.text import read_text
 from sb3_sparse.tuning.backend import BaseDistribution
 from sb3_sparse.tuning.shipped import paper_space, wide_space
 from sb3_sparse.tuning.spaces import (
@@ -52,7 +53,7 @@ def space_of(what: str, run: Run) -> Space:
         )
     if not path.is_file():
         raise ConfigError(f"there is no search space {path}")
-    code = path.read_text()
+    code = read_text(path, "search space", "give a file of your own (docs/tuning.md)")
     found = run_code(code, path.name)
     if isinstance(found, Mapping):
         return Space(path.stem, _distributions(found, path.name))

@@ -1,11 +1,12 @@
-"""Watching and scoring what a run has trained."""
+"""Watching and scoring a saved model."""
 
 from __future__ import annotations
 
 import importlib.util
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,14 +16,9 @@ from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecVideoRecorder
 
 from sb3_sparse.errors import ConfigError, MissingExtra
-from sb3_sparse.zoo.environments import (
-    import_packages,
-    is_atari,
-    known_environment,
-    package_names,
-)
-from sb3_sparse.zoo.experiment import envs_of_run, load_for_prediction, quiet
-from sb3_sparse.zoo.saved import arguments_of, environment_in, model_in
+from sb3_sparse.zoo.experiment import quiet
+from sb3_sparse.zoo.finetune import environment_of, envs_of, evaluated_deterministically
+from sb3_sparse.zoo.saved import Saved, find_saved
 
 VIDEO_STEPS = 1000
 
@@ -46,68 +42,87 @@ class Score:
 
 
 def enjoy(
-    folder: Path,
+    path: Path,
     episodes: int = 20,
     best: bool = False,
     video: bool = False,
     seed: int = 0,
     gym_packages: Sequence[str] = (),
+    *,
+    algo: str | None = None,
+    env_id: str | None = None,
+    vecnormalize: Path | None = None,
 ) -> Score:
-    """Evaluate a run's policy, deterministically (but for Atari games), as rl-zoo does.
+    """Evaluate a saved policy, deterministically (but for Atari games), as rl-zoo does.
 
-    :param folder: of a run, of ``sb3-sparse train`` or of ``rl_zoo3.train``
+    :param path: a run's folder, of ``sb3-sparse train`` or of ``rl_zoo3.train``, or a zip of SB3
     :param episodes: how many, 1 or more
-    :param best: the best policy instead of the last
-    :param video: record the first 1000 steps in ``<folder>/videos``
+    :param best: of a folder, the best policy instead of the last
+    :param video: record the first 1000 steps in a folder ``videos`` beside the zip
     :param seed: of the environment
     :param gym_packages: modules that register environments, beside those that the run names
-    :raises ConfigError: if there is no run or no such model in it
+    :param algo: None: as the run's folder or the file says
+    :param env_id: None: as the run's folder says
+    :param vecnormalize: statistics of a VecNormalize; None: those in the run's folder
+    :raises ConfigError: if there is no model, or what belongs to it is missing
+    :raises CorruptStateError: if a file is damaged
+    :raises Diverged: if the network is not finite
     """
     if episodes < 1:
         raise ConfigError(f"episodes must be 1 or more, got {episodes}")
-    arguments = arguments_of(folder)
-    algo = arguments["algo"]
-    env_id, packages = environment_in(arguments)
-    assert env_id is not None
-    import_packages(package_names([*packages, *gym_packages]))
-    known_environment(env_id)
-    env_name = env_id.replace("/", "-")
-    path = model_in(folder, env_id, best)
+    saved = find_saved(
+        path,
+        best=best,
+        algo=algo,
+        env_id=env_id,
+        vecnormalize=vecnormalize,
+        gym_packages=gym_packages,
+    )
+    environment_of(saved)
     if video and importlib.util.find_spec("moviepy") is None:
         raise MissingExtra("recording a video", "video")
     if video and sys.platform == "linux" and not os.environ.get("DISPLAY"):
         os.environ.setdefault("MUJOCO_GL", "egl")  # MuJoCo's way to render without a display
     set_random_seed(seed)
-    env_kwargs: dict[str, Any] = dict(arguments.get("env_kwargs") or {})
-    if video:
-        env_kwargs["render_mode"] = "rgb_array"
-    with quiet():
-        env = envs_of_run(env_id, folder / env_name, env_kwargs, seed)
-        model = load_for_prediction(algo, path)
-        if video:
-            env = VecVideoRecorder(
-                env,
-                str(folder / "videos"),
-                record_video_trigger=lambda step: step == 0,
-                video_length=VIDEO_STEPS,
-                name_prefix=path.stem,
-            )
+    kwargs: dict[str, Any] = {"render_mode": "rgb_array"} if video else {}
+    env = envs_of(saved, 1, seed, env_kwargs=kwargs)
+    folder = saved.path.parent / "videos"
     try:
-        with quiet():
+        model = saved.load()
+        saved.check_suits(env, model.observation_space, model.action_space)
+        with _filmed(saved, video), quiet():
+            if video:
+                env = VecVideoRecorder(
+                    env,
+                    str(folder),
+                    record_video_trigger=lambda step: step == 0,
+                    video_length=VIDEO_STEPS,
+                    name_prefix=saved.path.stem,
+                )
+            deterministic = evaluated_deterministically(saved)
             mean, std = evaluate_policy(
-                model, env, n_eval_episodes=episodes, deterministic=not is_atari(env_id)
+                model, env, n_eval_episodes=episodes, deterministic=deterministic
             )
-    except Exception as error:
-        if not video:
-            raise
-        raise ConfigError(
-            f"{env_id} could not be filmed: {type(error).__name__}: {error}. It must render "
-            "'rgb_array'; MuJoCo without a display needs MUJOCO_GL=egl or osmesa and its library"
-        ) from error
     finally:
         with quiet():
             env.close()
     assert not isinstance(mean, list)
     assert not isinstance(std, list)
-    videos = tuple(sorted((folder / "videos").glob(f"{path.stem}*"))) if video else ()
-    return Score(path, float(mean), float(std), episodes, videos)
+    videos = tuple(sorted(folder.glob(f"{saved.path.stem}*"))) if video else ()
+    return Score(saved.path, float(mean), float(std), episodes, videos)
+
+
+@contextmanager
+def _filmed(saved: Saved, video: bool) -> Iterator[None]:
+    """Within it, what goes wrong while a video is made is said of the video."""
+    try:
+        yield
+    except OSError:
+        raise  # a folder that cannot be written to names itself
+    except Exception as error:
+        if not video:
+            raise
+        raise ConfigError(
+            f"{saved.env_id} could not be filmed: {type(error).__name__}: {error}. It must render "
+            "'rgb_array'; MuJoCo without a display needs MUJOCO_GL=egl or osmesa and its library"
+        ) from error

@@ -4,24 +4,28 @@ from __future__ import annotations
 
 import json
 import shutil
-import zlib
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from zipfile import BadZipFile, ZipFile
+from zipfile import ZipFile
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_sparse.errors import ConfigError
+from sb3_sparse.errors import CorruptStateError
+from sb3_sparse.loading.arrays import read_arrays
+from sb3_sparse.loading.guard import reading
+from sb3_sparse.loading.text import read_json
 from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.policies.mixin import SparsePolicyMixin
 
 NPZ = "evaluations.npz"
 BEST = "best_model.zip"
 STATE = "evaluation.json"
+CURE = (
+    "nothing was changed. Restore it from a copy, or train anew: the run keeps its best model and "
+    "evaluations"
+)
 
 
 @dataclass(frozen=True)
@@ -45,33 +49,27 @@ class Evaluated:
     def read(cls, folder: Path) -> Evaluated:
         """Read them, and see that the best model is whole.
 
-        :raises ConfigError: if a file is damaged or missing
+        :raises ConfigError: if a file is missing
+        :raises CorruptStateError: if a file is damaged
         """
-        with _whole(folder / STATE) as path:
-            state = json.loads(path.read_text())
+        what, path = "file of a checkpoint", folder / STATE
+        state = read_json(path, what, CURE)
+        with reading(path, what, CURE):
             best, count = float(state["best_mean_reward"]), int(state["count"])
-        if (folder / BEST).is_file():
-            with _whole(folder / BEST) as path, ZipFile(path) as file:
+        path = folder / BEST
+        if path.is_file():
+            with reading(path, what, CURE), ZipFile(path) as file:
                 damaged = file.testzip()
-                if damaged is not None:
-                    raise ValueError(f"its part {damaged} does not have the checksum it should")
+            if damaged is not None:
+                raise CorruptStateError(f"{path} is damaged: the checksum of {damaged}; {CURE}")
         if count == 0:
             return cls(best)
-        names = ("timesteps", "results", "ep_lengths", "successes")
-        with _whole(folder / NPZ) as path, np.load(path) as saved:
-            return cls(best, *(saved[name].tolist() for name in names if name in saved))
-
-
-@contextmanager
-def _whole(path: Path) -> Iterator[Path]:
-    """Say which file is damaged."""
-    try:
-        yield path
-    except (OSError, EOFError, ValueError, KeyError, TypeError, BadZipFile, zlib.error) as error:
-        raise ConfigError(
-            f"{path} is damaged ({type(error).__name__}: {error}), and nothing was changed; "
-            "restore it from a copy, or train anew: the run keeps its best model and evaluations"
-        ) from error
+        needed, path = ("timesteps", "results", "ep_lengths"), folder / NPZ
+        saved = read_arrays(path, what, CURE, needed)
+        if any(array.shape[:1] != (count,) for array in saved.values()):
+            raise CorruptStateError(f"{path} is damaged: it has not {count} evaluations; {CURE}")
+        names = (*needed, "successes")
+        return cls(best, *(saved[name].tolist() for name in names if name in saved))
 
 
 class Evaluation(EvalCallback):
@@ -134,7 +132,7 @@ class Evaluation(EvalCallback):
     def restore(self, folder: Path) -> None:
         """Take back what :meth:`save` saved; what was evaluated after that is forgotten.
 
-        :raises ConfigError: if something of it is damaged; then all stays as it is
+        :raises CorruptStateError: if something of it is damaged; then all stays as it is
         """
         saved = Evaluated.read(folder)
         for name in (NPZ, BEST):

@@ -6,7 +6,7 @@ import io
 import warnings
 from argparse import Namespace
 from collections import OrderedDict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, redirect_stdout
 from copy import deepcopy
 from pathlib import Path
@@ -16,7 +16,7 @@ from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_sparse.errors import MissingExtra
 from sb3_sparse.policies.saving import load_without_buffer
@@ -28,7 +28,7 @@ from sb3_sparse.zoo.run import Run
 try:
     from rl_zoo3.callbacks import SaveVecNormalizeCallback
     from rl_zoo3.exp_manager import ExperimentManager
-    from rl_zoo3.utils import ALGOS, create_test_env, get_saved_hyperparams
+    from rl_zoo3.utils import ALGOS
 except ImportError as error:
     raise MissingExtra("training runs", "zoo") from error
 
@@ -165,45 +165,9 @@ def spaces_of(
     return envs.observation_space, envs.action_space
 
 
-def envs_of_run(
-    env_id: str,
-    params: Path,
-    env_kwargs: dict[str, Any],
-    seed: int,
-    n_envs: int = 1,
-    wrappers: Sequence[Mapping[str, Any]] = (),
-) -> VecEnv:
-    """Environments with the wrappers, stacking and normalisation of a finished run.
-
-    :param params: folder of the run's ``config.yml`` and normalisation
-    :param n_envs: how many side by side, in this process
-    :param wrappers: further ones, around those of the run but below stacking and normalisation;
-        each a path to its arguments, as in rl-zoo's ``env_wrapper``
-    """
-    hyperparams, stats = get_saved_hyperparams(str(params))
-    if wrappers:
-        own = hyperparams.get("env_wrapper") or []
-        hyperparams["env_wrapper"] = [*(own if isinstance(own, list) else [own]), *wrappers]
-    env: VecEnv = create_test_env(
-        env_id,
-        n_envs=n_envs,
-        stats_path=stats,
-        seed=seed,
-        should_render=False,
-        hyperparams=hyperparams,
-        env_kwargs={**hyperparams.pop("env_kwargs", {}), **env_kwargs},
-        vec_env_cls=DummyVecEnv,
-    )
-    return env
-
-
-def saved_settings(params: Path) -> dict[str, Any]:
-    """The settings in a run's ``config.yml``; empty if it has none.
-
-    :param params: folder of the run's ``config.yml`` and normalisation
-    """
-    settings: dict[str, Any] = get_saved_hyperparams(str(params))[0]
-    return settings
+def loadable_algorithms() -> list[str]:
+    """Names of the algorithms that rl-zoo knows, those without a sparse policy too."""
+    return list(ALGOS)
 
 
 def load_for_prediction(algo: str, path: Path) -> BaseAlgorithm:

@@ -1,17 +1,21 @@
-"""Looking into a saved model."""
+"""Looking into a saved model without running anything that its file says."""
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import torch as th
+
 from sb3_sparse.engine.auto import Choice, choose
-from sb3_sparse.errors import ConfigError
-from sb3_sparse.policies.mixin import SparsePolicyMixin
+from sb3_sparse.errors import CorruptStateError
+from sb3_sparse.loading.zips import CURE, check_state, look_into
 from sb3_sparse.policies.report import SparsityReport
-from sb3_sparse.zoo.saved import arguments_of, is_run, model_in, read_zip, zip_path
-from sb3_sparse.zoo.speed import use_few_threads
+from sb3_sparse.zoo.folder import arguments_of, is_run, model_in, zip_path
+from sb3_sparse.zoo.outline import outline_of
+from sb3_sparse.zoo.positions import image_in
 
 
 @dataclass(frozen=True)
@@ -36,36 +40,43 @@ class Inspection:
         return "\n".join(parts)
 
 
-def _load(path: Path) -> tuple[SparsePolicyMixin, dict[str, Any]]:
-    """The sparse policy in a zip that SB3 saved, whichever algorithm trained it, and its data.
+def inspect_model(path: Path) -> Inspection:
+    """The sparsity report of a saved model, and how its layers would best be computed here.
 
+    Nothing is unpickled and no class that the file names is imported, so that a stranger's file can
+    be looked into.
+
+    :param path: a run's folder, or a zip that SB3 saved, whichever algorithm trained it
     :raises ConfigError: if there is no such file, or no sparse policy in it
+    :raises CorruptStateError: if the file is damaged
+    :raises Diverged: if the network is not finite
     """
-    if is_run(path):
+    if is_run(path) or path.is_dir():
         path = model_in(path, arguments_of(path)["env"], False)
     path = zip_path(path)
-    data, state = read_zip(path)
-    policy_class = data.get("policy_class")
-    if not (isinstance(policy_class, type) and issubclass(policy_class, SparsePolicyMixin)):
-        name = getattr(policy_class, "__name__", "none")
-        raise ConfigError(f"the policy in {path} is not sparse but {name}")
-    kwargs = {**data["policy_kwargs"], "compute": "masked"}  # which every machine can
-    if data["use_sde"]:
-        kwargs["use_sde"] = True
-    policy = policy_class(
-        data["observation_space"], data["action_space"], policy_class._dummy_schedule, **kwargs
-    )
-    policy.load_state_dict(state)
-    return policy, data
-
-
-def inspect_model(path: Path) -> Inspection:
-    """The sparsity report of a saved model, and how its layers would best be computed here."""
-    policy, data = _load(path)
-    batch = data.get("batch_size") or data["n_steps"] * data["n_envs"]  # A2C: the whole rollout
-    use_few_threads(policy.observation_space)
+    contents = look_into(path)
+    check_state(contents.state, str(path))
+    data = contents.data
+    image = image_in(data.get("observation_space"))
+    outline = outline_of(contents.state, image, str(path))
+    kwargs = data.get("policy_kwargs")
+    compute = kwargs.get("compute", "auto") if isinstance(kwargs, dict) else "auto"
+    batch = _batch(data, path)
+    if "OMP_NUM_THREADS" not in os.environ and image is None:
+        th.set_num_threads(1)
     return Inspection(
-        report=policy.sparsity_report(),
-        choice=choose(policy, list(policy.sparse.layers), batch),
-        compute=data["policy_kwargs"].get("compute", "auto"),
+        report=outline.report,
+        choice=choose(outline.root, outline.layers, batch),
+        compute=str(compute),
     )
+
+
+def _batch(data: dict[str, Any], path: Path) -> int:
+    """Entries of a minibatch; of A2C, the whole rollout."""
+    batch = data.get("batch_size")
+    if batch is None:
+        steps, envs = data.get("n_steps"), data.get("n_envs")
+        batch = steps * envs if isinstance(steps, int) and isinstance(envs, int) else None
+    if type(batch) is not int or not 0 < batch < 2**24:
+        raise CorruptStateError(f"{path} is damaged: its batch size is {batch!r}; {CURE}")
+    return batch

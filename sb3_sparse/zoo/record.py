@@ -10,10 +10,13 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from sb3_sparse.errors import ConfigError
+from sb3_sparse.errors import ConfigError, CorruptStateError
+from sb3_sparse.loading.text import read_json
 from sb3_sparse.policies.mixin import SparsePolicyMixin
 
 NAME = "sparsity.json"
+WHAT = "record of a run"
+CURE = "restore it from a copy, or remove the run's folder and train anew"
 FORMAT = 1
 PACKAGES = (
     "sb3-sparse",
@@ -29,7 +32,7 @@ PACKAGES = (
 def write_record(folder: Path, **content: Any) -> None:
     """Write the file, whole or not at all. What it had under other names stays."""
     path = folder / NAME
-    known = json.loads(path.read_text()) if path.is_file() else {"format": FORMAT}
+    known = read_json(path, WHAT, CURE) if path.is_file() else {"format": FORMAT}
     new = path.with_suffix(".new")
     new.write_text(json.dumps({**known, **content}, indent=1, default=_plain) + "\n")
     new.replace(path)
@@ -38,7 +41,8 @@ def write_record(folder: Path, **content: Any) -> None:
 def read_record(folder: Path) -> dict[str, Any]:
     """The content of a run's file.
 
-    :raises ConfigError: if the folder has none, or it is damaged
+    :raises ConfigError: if the folder has none
+    :raises CorruptStateError: if it is damaged
     """
     path = folder / NAME
     if not path.is_file():
@@ -46,10 +50,9 @@ def read_record(folder: Path) -> dict[str, Any]:
             f"there is no run of sb3-sparse in {folder} (it would hold {NAME}); give the run's own "
             "folder, e.g. logs/sac/HalfCheetah-v5_1"
         )
-    try:
-        content: dict[str, Any] = json.loads(path.read_text())
-    except json.JSONDecodeError as error:
-        raise ConfigError(f"{path} is damaged: {error}") from error
+    content = read_json(path, WHAT, CURE)
+    if not isinstance(content.get("status"), str):
+        raise CorruptStateError(f"{path} is damaged: it has no status; {CURE}")
     return content
 
 

@@ -2,25 +2,35 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
-import yaml
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.save_util import load_from_zip_file
+from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_sparse.errors import ConfigError, CorruptStateError
+from sb3_sparse.loading.guard import reading
+from sb3_sparse.loading.zips import check_state, look_into, read_model
 from sb3_sparse.policies.saving import differ
-from sb3_sparse.zoo.environments import package_names, plain_id
-from sb3_sparse.zoo.experiment import load_for_prediction, saved_settings
+from sb3_sparse.zoo.environments import package_names
+from sb3_sparse.zoo.experiment import load_for_prediction, loadable_algorithms, quiet
+from sb3_sparse.zoo.folder import (
+    ARGUMENTS,
+    CONFIG,
+    VECNORMALIZE,
+    arguments_of,
+    environment_in,
+    environment_settings,
+    is_run,
+    model_in,
+    params_of,
+    zip_path,
+)
 from sb3_sparse.zoo.run import algorithms
 
-VECNORMALIZE = "vecnormalize.pkl"
 BY_POLICY = {
     "DQNPolicy": "dqn",
     "QRDQNPolicy": "qrdqn",
@@ -44,6 +54,8 @@ class Saved:
     :param env_id: what it was trained in; None: not known
     :param params: folder of its run's ``config.yml`` and normalisation; None: it lies in no run
     :param vecnormalize: statistics that its observations were normalised by; None: they were not
+    :param settings: how its environments were made, by the names of
+        :data:`~sb3_sparse.zoo.folder.OF_ENVIRONMENT`; empty if it lies in no run
     :param gym_packages: modules that register its environment
     """
 
@@ -52,24 +64,49 @@ class Saved:
     env_id: str | None = None
     params: Path | None = None
     vecnormalize: Path | None = None
+    settings: Mapping[str, Any] = field(default_factory=dict)
     gym_packages: tuple[str, ...] = ()
 
     def load(self, env: VecEnv | None = None) -> BaseAlgorithm:
         """The model; without an environment it is fit for prediction only.
 
+        Unpickles what SB3 pickled: the file must come from somebody who is trusted.
+
         :param env: to go on training in
-        :raises ConfigError: if the file is of another algorithm, or does not suit ``env``
-        :raises CorruptStateError: if masks and weights in the file disagree
+        :raises ConfigError: if there is no such file, or it does not suit ``env``
+        :raises CorruptStateError: if the file is damaged or of another algorithm, or if masks and
+            weights in it disagree
+        :raises Diverged: if its network is not finite
         """
-        check_masks(self.path)
-        try:
+        check_state(look_into(self.path).state, str(self.path))
+        if env is not None:
+            data, _ = read_model(self.path)
+            self.check_suits(env, data.get("observation_space"), data.get("action_space"))
+        with reading(
+            self.path,
+            f"model of {self.algo}",
+            "give the --algo that it was trained with, or an earlier checkpoint",
+        ):
             if env is None:
                 return load_for_prediction(self.algo, self.path)
             model: BaseAlgorithm = algorithms()[self.algo].load(self.path, env=env)
             return model
-        except (KeyError, TypeError, ValueError) as error:
+
+    def check_suits(self, env: VecEnv, observations: Any, actions: Any) -> None:
+        """Refuse an environment that shows or takes something else than the model knows.
+
+        :param observations: the model's space of them
+        :param actions: the model's space of them
+        :raises ConfigError: if so
+        """
+        try:
+            with quiet():
+                seen = BaseAlgorithm._wrap_env(env, verbose=0, monitor_wrapper=False)
+            check_for_correct_spaces(seen, observations, actions)
+        except (ValueError, AssertionError) as error:
             raise ConfigError(
-                f"{self.path} cannot be loaded as a model of {self.algo}: {error}"
+                f"{self.path} does not suit {self.env_id}: {error}; give the environment that it "
+                "was trained in, and a run's folder where it wraps or stacks observations"
             ) from error
 
 
@@ -91,7 +128,8 @@ def find_saved(
     :param env_id: None: as the run's folder says
     :param vecnormalize: statistics of a VecNormalize; None: those in the run's folder
     :param gym_packages: modules that register environments, beside those that the run names
-    :raises ConfigError: if there is no model, or its statistics are missing
+    :raises ConfigError: if there is no model, or what belongs to it is missing
+    :raises CorruptStateError: if one of the files is damaged
     """
     if not is_run(path):
         path = zip_path(path)
@@ -99,30 +137,67 @@ def find_saved(
     arguments = arguments_of(folder) if path.is_dir() or is_run(folder) else {}
     env_id, packages = environment_in({**arguments, "env": env_id or arguments.get("env")})
     packages = package_names([*packages, *gym_packages])
-    params = _params_of(folder, arguments["env"]) if arguments else None
+    params = params_of(folder, arguments["env"]) if arguments else None
     if path.is_dir():
         path = model_in(folder, arguments["env"], best)
-    if vecnormalize is None and params is not None and saved_settings(params).get("normalize"):
-        vecnormalize = params / VECNORMALIZE
-        if not vecnormalize.is_file():
-            raise ConfigError(
-                f"the run in {folder} normalised its observations, but {vecnormalize} is missing; "
-                "give the statistics with --vecnormalize FILE"
-            )
+    if params is not None and arguments["algo"] not in loadable_algorithms():
+        raise CorruptStateError(
+            f"{params / ARGUMENTS} is damaged: algo is {arguments['algo']!r}; known are "
+            f"{', '.join(loadable_algorithms())}"
+        )
     algo = _algo(path, algo, arguments.get("algo"))
-    if vecnormalize is None and params is None and algo in ON_POLICY:
-        data, _ = read_zip(path)
-        if differ(data.get("_last_obs"), data.get("_last_original_obs")):
-            raise ConfigError(
-                f"{path} was trained under a VecNormalize; give its statistics with --vecnormalize "
-                "FILE, also if it normalised rewards alone"
-            )
+    settings: Mapping[str, Any] = {}
+    if params is not None and (vecnormalize is None or (params / CONFIG).is_file()):
+        settings = environment_settings(params)
+    if vecnormalize is None:
+        vecnormalize = _statistics_of_run(params, settings) if params else None
+    if vecnormalize is None and params is None:
+        _check_lone(path, algo)
     if vecnormalize is not None and not vecnormalize.is_file():
         raise ConfigError(
             f"there is no file {vecnormalize}; give what VecNormalize.save wrote, e.g. "
             f"{VECNORMALIZE}"
         )
-    return Saved(path, algo, env_id, params, vecnormalize, packages)
+    return Saved(path, algo, env_id, params, vecnormalize, settings, packages)
+
+
+def _statistics_of_run(params: Path, settings: Mapping[str, Any]) -> Path | None:
+    """The statistics in a run's folder; None if it was not normalised.
+
+    :raises ConfigError: if they are not there though it was, or there though it was not
+    """
+    path = params / VECNORMALIZE
+    if settings["normalize"] and not path.is_file():
+        raise ConfigError(
+            f"the run in {params.parent} normalised its observations, but {path} is missing; "
+            "give the statistics with --vecnormalize FILE"
+        )
+    if path.is_file() and not settings["normalize"]:
+        raise ConfigError(
+            f"{path} is there, though {params / CONFIG} says that nothing was normalised; give "
+            f"--vecnormalize {path} to use it, or remove it"
+        )
+    return path if settings["normalize"] else None
+
+
+def _check_lone(path: Path, algo: str) -> None:
+    """Refuse a zip outside a run that was, or may have been, normalised.
+
+    :raises ConfigError: if so
+    """
+    for beside in (path.with_name(VECNORMALIZE), path.with_suffix("") / VECNORMALIZE):
+        if beside.is_file():
+            raise ConfigError(
+                f"{beside} lies beside {path}: give --vecnormalize {beside} if the observations of "
+                "this model were normalised by it, else move it elsewhere"
+            )
+    if algo in ON_POLICY:
+        data, _ = read_model(path)
+        if differ(data.get("_last_obs"), data.get("_last_original_obs")):
+            raise ConfigError(
+                f"{path} was trained under a VecNormalize; give its statistics with --vecnormalize "
+                "FILE, also if it normalised rewards alone"
+            )
 
 
 def _algo(path: Path, given: str | None, known: str | None) -> str:
@@ -145,7 +220,7 @@ def algo_of(path: Path) -> str:
 
     :raises ConfigError: if it is no model, or of an algorithm that is not supported
     """
-    data, _ = read_zip(path)
+    data, _ = read_model(path)
     policy = data.get("policy_class")
     names = [cls.__name__ for cls in policy.__mro__] if isinstance(policy, type) else []
     foreign = any(name.startswith(FOREIGN) for name in names)
@@ -159,106 +234,3 @@ def algo_of(path: Path) -> str:
         f"{path} has the policy {names[0] if names else policy!r}, which belongs to no supported "
         f"algorithm; allowed are {', '.join(algorithms())}"
     )
-
-
-def read_zip(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    """What SB3 saved: data, and the policy's state_dict.
-
-    :raises ConfigError: if there is no such file, or it is no model
-    """
-    if not path.is_file():
-        raise ConfigError(f"there is no file {path}; give a model saved by SB3, e.g. model.zip")
-    try:
-        data, params, _ = load_from_zip_file(path, device="cpu")
-    except (BadZipFile, ValueError) as error:
-        raise ConfigError(f"{path} is no model saved by SB3: {error}") from error
-    if data is None or "policy" not in params:
-        raise ConfigError(f"{path} is damaged: it has no data or no policy in it")
-    state: Any = params["policy"]
-    return data, state
-
-
-def zip_path(path: Path) -> Path:
-    """The path with the suffix that SB3 adds, where it was left out."""
-    if not path.name or path.suffix:
-        return path
-    with_suffix = path.with_suffix(".zip")
-    return with_suffix if with_suffix.is_file() else path
-
-
-def check_masks(path: Path) -> None:
-    """Refuse a file with weights where its masks have none, which loading would set to 0.
-
-    :raises CorruptStateError: if so
-    """
-    _, state = read_zip(path)
-    for name, mask in state.items():
-        if name.endswith("_mask") and name.removesuffix("_mask") in state:
-            weight = state[name.removesuffix("_mask")]
-            wrong = int((weight[~mask.bool()] != 0).sum())
-            if wrong:
-                raise CorruptStateError(
-                    f"masks and weights disagree in {path}: {wrong} connections of "
-                    f"{name.removesuffix('.weight_mask')} are not 0 though its mask has them "
-                    "inactive; somebody changed the file. Take an earlier one, or load it with "
-                    "<algorithm>.load, which sets them to 0, and save it again"
-                )
-
-
-def model_in(folder: Path, env_id: str, best: bool) -> Path:
-    """The last or best policy in a run's folder.
-
-    :raises ConfigError: if there is none
-    """
-    path = folder / ("best_model.zip" if best else f"{env_id.replace('/', '-')}.zip")
-    if not path.is_file():
-        models = ", ".join(sorted(file.name for file in folder.glob("*.zip"))) or "none"
-        why = (
-            "there is a best policy after the first evaluation at the sparsity asked for"
-            if best
-            else "a run that was killed has its last policy after sb3-sparse train --resume"
-        )
-        raise ConfigError(f"{folder} has no {path.name} (its models: {models}): {why}")
-    return path
-
-
-def arguments_of(folder: Path) -> dict[str, Any]:
-    """What a run was started with, from the file that rl-zoo writes.
-
-    :raises ConfigError: if there is no run
-    """
-    files = list(folder.glob("*/args.yml"))
-    compression = folder / "compress.json"
-    if not files and compression.is_file():
-        if json.loads(compression.read_text()).get("finished"):
-            raise ConfigError(f"{folder} is no run's folder; give the zip in it")
-        raise ConfigError(
-            f"the compression in {folder} is not finished; give its command again, and it goes on"
-        )
-    if len(files) != 1:
-        raise ConfigError(
-            f"there is no run in {folder}; give the run's own folder, e.g. "
-            "logs/sac/HalfCheetah-v5_1"
-        )
-    # rl-zoo writes Python objects into it
-    arguments = yaml.load(files[0].read_text(), Loader=yaml.UnsafeLoader)
-    return dict(arguments)
-
-
-def environment_in(arguments: Mapping[str, Any]) -> tuple[str | None, tuple[str, ...]]:
-    """The environment's plain id in a run's arguments, and the modules that register it.
-
-    :param arguments: as :func:`arguments_of` returns them
-    """
-    packages = package_names(arguments.get("gym_packages"))
-    env_id = arguments.get("env")
-    return (None, packages) if env_id is None else plain_id(str(env_id), packages)
-
-
-def is_run(folder: Path) -> bool:
-    """Whether a folder is that of a run."""
-    return len(list(folder.glob("*/args.yml"))) == 1
-
-
-def _params_of(folder: Path, env_id: str) -> Path:
-    return folder / env_id.replace("/", "-")

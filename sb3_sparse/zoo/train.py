@@ -25,6 +25,7 @@ from sb3_sparse.zoo.checkpoint import (
 )
 from sb3_sparse.zoo.evaluation import Evaluated, Evaluation
 from sb3_sparse.zoo.experiment import Experiment, spaces_of
+from sb3_sparse.zoo.plan import check_start, planned
 from sb3_sparse.zoo.prepare import doubt, explained, prepare
 from sb3_sparse.zoo.record import NAME, read_record, sparsity_of, write_record
 from sb3_sparse.zoo.results import Outcome, final_results
@@ -105,8 +106,8 @@ def resume(folder: Path, callbacks: Sequence[BaseCallback] = ()) -> Outcome:
                 f"the run in {folder} is finished; look at it with sb3-sparse enjoy {folder}, or "
                 "train longer anew with -n"
             )
-        run = Run(**record["run"])
-        settings, evaluation = record["settings"], record["evaluation"]
+        plan = planned(folder, record)
+        run, settings, evaluation = plan.run, plan.settings, plan.evaluation
         start = folder if record.get("trained") else last_checkpoint(folder)
         failure = (
             f"nothing was changed: the run in {folder} cannot go on from {start or 'its start'}"
@@ -114,13 +115,13 @@ def resume(folder: Path, callbacks: Sequence[BaseCallback] = ()) -> Outcome:
         with explained(failure, run.env_id), ExitStack() as stack:
             observation_space, _ = spaces_of(run, settings, folder, evaluation)
             use_few_threads(observation_space)
+            if start is not None:
+                check_start(start, run.env_id)
             if start != folder:
                 if start is not None:
                     Evaluated.read(start)  # all is read before anything is replaced
                 stack.enter_context(restored_monitors(folder, start))
-            experiment = Experiment(
-                run, settings, folder, evaluation, start, record["tensorboard_log"]
-            )
+            experiment = Experiment(run, settings, folder, evaluation, start, plan.tensorboard_log)
             model = experiment.setup()
         try:
             return _learn(run, experiment, model, folder, start, callbacks)

@@ -227,7 +227,7 @@ def test_noise_is_measured_of_the_trained_model_without_training_it_again(traine
 
 def test_ten_noisy_environments_are_of_one_process(trained):
     made, store = trained
-    _, with_noise = noisy_envs(made.cells[0].folder(store), "CartPole-v1", "dqn")
+    _, with_noise = noisy_envs(made.cells[0].folder(store))
     envs = with_noise(1.0)
     assert isinstance(envs.unwrapped, DummyVecEnv)
     assert envs.num_envs == 10

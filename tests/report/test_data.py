@@ -75,8 +75,11 @@ def test_an_unfinished_run_is_named(folders, status):
     ("spoil", "said"),
     [
         (lambda f: (f / "sparsity.json").write_text('{"status": "fin'), "damaged"),
-        (lambda f: (f / "sparsity.json").write_text("[]"), "no mapping"),
-        (lambda f: (f / "sparsity.json").write_bytes(b"\xff\xfe\x00"), "cannot be read"),
+        (
+            lambda f: (f / "sparsity.json").write_text("[]"),
+            "holds a list where a mapping should be",
+        ),
+        (lambda f: (f / "sparsity.json").write_bytes(b"\xff\xfe\x00"), "is not UTF-8 text"),
         (lambda f: (f / "sparsity.json").unlink(), "no run of sb3-sparse"),
         (lambda f: (f / "evaluations.npz").unlink(), "evaluations.npz is missing"),
         (lambda f: (f / "evaluations.npz").write_bytes(b"PK\x03\x04 half"), "damaged"),

@@ -25,9 +25,10 @@ from sb3_sparse.tuning.spaces import Space
 from sb3_sparse.zoo.enjoy import enjoy
 from sb3_sparse.zoo.environments import import_packages, plain_id
 from sb3_sparse.zoo.finetune import evaluation_envs, training_envs, write_run_files
+from sb3_sparse.zoo.folder import arguments_of
 from sb3_sparse.zoo.inspect import inspect_model
 from sb3_sparse.zoo.run import Run
-from sb3_sparse.zoo.saved import arguments_of, find_saved
+from sb3_sparse.zoo.saved import find_saved
 from sb3_sparse.zoo.train import resume, train
 
 SOURCE = """

@@ -16,7 +16,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import load_results
 from support import ALGORITHMS
 
-from sb3_sparse.errors import ConfigError
+from sb3_sparse.errors import ConfigError, CorruptStateError
 from sb3_sparse.zoo.checkpoint import last_checkpoint
 from sb3_sparse.zoo.enjoy import enjoy
 from sb3_sparse.zoo.record import read_record
@@ -259,7 +259,7 @@ def test_a_run_that_failed_says_so_and_can_go_on(tmp_path):
 def test_a_checkpoint_that_cannot_be_read_is_named(tmp_path):
     stopped = train(DQN_RUN, tmp_path, [Stop(500)])
     (last_checkpoint(stopped.folder) / "CartPole-v1.zip").write_bytes(b"")
-    with pytest.raises(ConfigError, match=r"cannot go on from .*resume/500: ValueError"):
+    with pytest.raises(CorruptStateError, match=r"resume/500/CartPole-v1.zip is damaged"):
         resume(stopped.folder)
 
 

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import io
-import pickle
-import zipfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch as th
 
+from sb3_sparse.errors import SparsityError
+from sb3_sparse.loading.zips import look_into
 from sb3_sparse.policies.compiled import plain_names
 from sb3_sparse.report.backend import MaxNLocator
 from sb3_sparse.report.data import Array, RunData
@@ -37,7 +35,7 @@ def draw(study: Study) -> Drawing:
     for run in _chosen(study):
         try:
             masks = masks_of(run)
-        except (OSError, KeyError, ValueError, RuntimeError, pickle.UnpicklingError) as error:
+        except SparsityError as error:
             remarks.append(f"{run.folder}: its model cannot be read: {error}")
             continue
         if masks:
@@ -87,20 +85,14 @@ def _chosen(study: Study) -> list[RunData]:
 def masks_of(run: RunData) -> list[tuple[str, tuple[int, ...], Array]]:
     """Names, shapes and block densities of the first layers' masks, out of the final model.
 
-    :raises OSError: if there is no model, or it is no zip
+    :raises ConfigError: if there is no model
+    :raises CorruptStateError: if it is damaged
     """
     path = Path(run.folder) / f"{run.env_id.replace('/', '-')}.zip"
-    try:
-        with zipfile.ZipFile(path) as content:
-            state = th.load(
-                io.BytesIO(content.read("policy.pth")), weights_only=True, map_location="cpu"
-            )
-    except zipfile.BadZipFile as error:
-        raise OSError(f"{path.name} is damaged: {error}") from error
-    state, found = plain_names(state), []
+    state, found = plain_names(look_into(path).state), []
     for layer in run.layers:
         mask = state.get(f"{layer['name']}.weight_mask")
-        if mask is not None:
+        if mask is not None and mask.dim() > 1:
             flat = mask.reshape(mask.shape[0], -1).numpy().astype(np.float64)
             found.append((str(layer["name"]), tuple(mask.shape), blocks_of(flat)))
     return found[:LAYERS]

@@ -1,0 +1,41 @@
+"""NumPy archives."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_sparse.errors import CorruptStateError
+from sb3_sparse.loading.guard import reading
+
+
+def read_arrays(
+    path: Path, what: str, cure: str, needed: Sequence[str] = ()
+) -> dict[str, NDArray[Any]]:
+    """All arrays in an ``.npz`` file, by name. Nothing is unpickled.
+
+    :param what: as of :func:`~sb3_sparse.loading.guard.reading`
+    :param cure: as of :func:`~sb3_sparse.loading.guard.reading`
+    :param needed: arrays that must be among them, of numbers or truth values
+    :raises ConfigError: if it cannot be opened
+    :raises CorruptStateError: if it holds something else
+    """
+    with reading(path, what, cure):
+        content = np.load(path, allow_pickle=False)
+        if not isinstance(content, np.lib.npyio.NpzFile):
+            raise CorruptStateError(f"{path} is damaged, or is no {what}: no archive; {cure}")
+        with content:
+            arrays = {name: content[name] for name in content.files}
+    for name in needed:
+        if name not in arrays:
+            raise CorruptStateError(f"{path} is damaged: {name} is missing; {cure}")
+        if arrays[name].dtype.kind not in "biuf":
+            raise CorruptStateError(
+                f"{path} is damaged: {name} is of {arrays[name].dtype} where numbers should be; "
+                f"{cure}"
+            )
+    return arrays

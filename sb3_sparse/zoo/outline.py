@@ -1,0 +1,189 @@
+"""A sparse policy's layers, told by its state_dict alone: no code of the file's is run."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch as th
+from torch import nn
+
+from sb3_sparse.engine.kernels import Kernel
+from sb3_sparse.engine.layers import SparseLayer
+from sb3_sparse.engine.masked import MaskedLayer
+from sb3_sparse.errors import ConfigError, CorruptStateError
+from sb3_sparse.policies.aliases import SparsePolicy, supported_algorithms
+from sb3_sparse.policies.compiled import plain_names
+from sb3_sparse.policies.report import LayerReport, SparsityReport
+from sb3_sparse.policies.spec import NetworkSpec
+from sb3_sparse.zoo.positions import positions_of
+
+WEIGHT, MASK, BIAS = ".weight", ".weight_mask", ".bias"
+CONVOLUTIONS = {3: nn.Conv1d, 4: nn.Conv2d, 5: nn.Conv3d}
+SQUASHED = "actor.mu."
+"""TD3's actor, and one with gSDE, end in an activation though they are an output."""
+
+IMPALA_BLOCK = ".layers."
+
+
+@dataclass(frozen=True)
+class Outline:
+    """What a state_dict tells of a policy.
+
+    :param report: its layers; FLOPs of a convolution are 0 where its strides are not known
+    :param root: modules of the same names and shapes, with activations between
+    :param layers: those within the budget
+    """
+
+    report: SparsityReport
+    root: nn.Module
+    layers: list[SparseLayer]
+
+
+def outline_of(state: Mapping[str, Any], image: tuple[int, ...] | None, where: str) -> Outline:
+    """The layers of a sparse policy.
+
+    :param state: its state_dict
+    :param image: shape of the images that it observes, channels first; None: it observes none
+    :param where: what to call the model in an error
+    :raises ConfigError: if the policy is not sparse
+    :raises CorruptStateError: if a layer can have no such name or shape
+    """
+    state = plain_names(state)
+    specs = _specs(state)
+    kernels = _kernels(state, specs)
+    if not any(name + MASK in state for name in kernels):
+        raise ConfigError(
+            f"the policy in {where} is not sparse: none of its layers has a mask. Make a sparse "
+            "twin of it with sb3-sparse compress"
+        )
+    root = nn.Module()
+    layers: list[SparseLayer] = []
+    reports = []
+    positions = positions_of({name: tuple(state[name + WEIGHT].shape) for name in kernels}, image)
+    for name, network in kernels.items():
+        weight, mask = state[name + WEIGHT], state.get(name + MASK)
+        if weight.numel() == 0:
+            raise CorruptStateError(f"{where} is damaged: {name} has shape {tuple(weight.shape)}")
+        try:
+            module = _place(root, name, weight, name + BIAS in state)
+        except KeyError as error:
+            raise CorruptStateError(f"{where} is damaged: {error.args[0]}") from error
+        nnz = weight.numel()
+        if mask is not None:
+            layer = MaskedLayer(name, module)
+            layer.set_mask(mask.bool().numpy())
+            layers.append(layer)
+            nnz = layer.nnz
+        biases = weight.shape[0] if name + BIAS in state else 0
+        units = weight.shape[0] if _activated(name, state, specs) else 0
+        places = positions.get(name, 1 if weight.dim() == 2 else 0)
+        reports.append(
+            LayerReport(
+                network=network,
+                name=name,
+                shape=tuple(weight.shape),
+                nnz=nnz,
+                parameters=nnz + biases,
+                flops=places * (2 * nnz + biases + units),
+                dense_flops=places * (2 * weight.numel() + biases + units),
+                in_budget=mask is not None,
+            )
+        )
+    _fill(root)
+    order = {network: place for place, network in enumerate(dict.fromkeys(kernels.values()))}
+    reports.sort(key=lambda one: (order[one.network], not one.in_budget))
+    return Outline(SparsityReport(tuple(reports)), root, layers)
+
+
+def _specs(state: Mapping[str, Any]) -> Mapping[str, NetworkSpec]:
+    """The networks of the first algorithm whose policy keeps its layers where the state does."""
+    for algorithm in supported_algorithms().values():
+        policy: Any = algorithm.policy_aliases[SparsePolicy]
+        specs: Mapping[str, NetworkSpec] = policy.networks
+        if all(any(_below(key, spec.roots) for key in state) for spec in specs.values()):
+            return specs
+    return {}
+
+
+def _below(name: str, roots: tuple[str, ...]) -> bool:
+    return any(name.startswith(f"{root}.") for root in roots)
+
+
+def _kernels(state: Mapping[str, Any], specs: Mapping[str, NetworkSpec]) -> dict[str, str]:
+    """Names of the layers and of their networks, each weight once, targets left out."""
+    targets = tuple(f"{spec.target}." for spec in specs.values() if spec.target is not None)
+    names = [
+        key.removesuffix(WEIGHT)
+        for key, value in state.items()
+        if key.endswith(WEIGHT) and isinstance(value, th.Tensor) and 2 <= value.dim() <= 5
+    ]
+    found: dict[str, str] = {}
+    seen: set[int] = set()
+    for network, spec in specs.items():
+        for root in spec.roots:
+            for name in names:
+                place = state[name + WEIGHT].data_ptr()  # shared weights are saved once
+                if _below(name + WEIGHT, (root,)) and place not in seen:
+                    seen.add(place)
+                    found[name] = network
+    for name in names:  # of a policy with networks of its own
+        if name + MASK in state and state[name + WEIGHT].data_ptr() not in seen:
+            found[name] = name.split(".")[0]
+    return {name: one for name, one in found.items() if not name.startswith(targets or ("\0",))}
+
+
+def _activated(name: str, state: Mapping[str, Any], specs: Mapping[str, NetworkSpec]) -> bool:
+    """Whether an activation follows a layer: it has no parameters, so its number is missing."""
+    module, _, number = name.rpartition(".")
+    if not number.isdigit():
+        return False
+    following = f"{module}.{int(number) + 1}."
+    if any(key.startswith(following) for key in state):
+        return False
+    inside = [key.removeprefix(module) for key in state if key.startswith(f"{module}.")]
+    blocks = any(IMPALA_BLOCK in key for key in inside)
+    if blocks or name.endswith(f"{IMPALA_BLOCK}3"):  # a pool follows, or the sum of the block
+        return False
+    last = not any(_number(key, module) > int(number) for key in state)
+    heads = [head for spec in specs.values() for head in spec.heads]
+    output = any(module == head or module.startswith(head.removesuffix("*")) for head in heads)
+    return not (last and output) or name.startswith(SQUASHED)
+
+
+def _number(key: str, module: str) -> int:
+    """The number of a key's part of a Sequential; -1 if it is not in it."""
+    rest = key.removeprefix(f"{module}.").split(".")[0] if key.startswith(f"{module}.") else ""
+    return int(rest) if rest.isdigit() else -1
+
+
+def _place(root: nn.Module, name: str, weight: th.Tensor, bias: bool) -> Kernel:
+    """Put a layer of a weight's shape under its dotted name."""
+    *path, last = name.split(".")
+    for part in path:
+        if part not in dict(root.named_children()):
+            root.add_module(part, nn.Module())
+        root = root.get_submodule(part)
+    outputs, inputs, *size = weight.shape
+    layer: Kernel
+    with th.device("meta"):
+        if weight.dim() == 2:
+            layer = nn.Linear(inputs, outputs, bias=bias)
+        else:
+            convolution: Any = CONVOLUTIONS[weight.dim()]
+            layer = convolution(inputs, outputs, tuple(size), bias=bias)
+    layer.weight = nn.Parameter(weight.detach().float())
+    root.add_module(last, layer)
+    return layer
+
+
+def _fill(root: nn.Module) -> None:
+    """Make modules of numbered children Sequentials, with an activation where a number lacks."""
+    for name, child in list(root.named_children()):
+        _fill(child)
+        numbers = [int(part) for part, _ in child.named_children() if part.isdigit()]
+        if numbers and type(child) is nn.Module and max(numbers) < 1000:
+            members = dict(child.named_children())
+            filled = (members.get(str(i), nn.ReLU()) for i in range(max(numbers) + 1))
+            setattr(root, name, nn.Sequential(*filled))
