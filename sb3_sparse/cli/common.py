@@ -7,10 +7,12 @@ from typing import Annotated, Any
 
 import typer
 from rich.console import Console
+from rich.text import Text
 
 from sb3_sparse.errors import ConfigError
 
-console = Console(highlight=False)
+console = Console(highlight=False, markup=False)
+"""Prints text as it is: names of folders may hold what Rich would take for markup."""
 INTERRUPTED = 130
 AS_CONFIG = "as the config"
 
@@ -71,8 +73,8 @@ LogFolder = Annotated[Path, text("Where folders are made.", "--log-folder", "-f"
 
 def print_score(what: str, mean: float, std: float, path: Path) -> None:
     """A line on a policy's return."""
-    score = f"{mean:.1f} ± {std:.1f}"
-    console.print(f"{what:<13} [bold]{score}[/bold]  {path}", soft_wrap=True)
+    score = (f"{mean:.1f} ± {std:.1f}", "bold")
+    console.print(Text.assemble(f"{what:<13} ", score, f"  {path}"), soft_wrap=True)
 
 
 def values_and_packages(

@@ -130,4 +130,4 @@ def _default_folder(model: Path, sparsity: float | None) -> Path:
 
 
 def _say(line: str) -> None:
-    console.print(line, markup=False, soft_wrap=True)
+    console.print(line, soft_wrap=True)

@@ -84,8 +84,8 @@ def run(
     for failed, error in last.failed.items():
         alike.setdefault(error.rstrip(), []).append(failed)
     for error, runs in alike.items():
-        console.print(f"\nFailed twice: {'; '.join(runs)}", markup=False, style="bold")
-        console.print(error, markup=False, soft_wrap=True)
+        console.print(f"\nFailed twice: {'; '.join(runs)}", style="bold")
+        console.print(error, soft_wrap=True)
     console.print(f"{last.done} of {last.planned} runs are done.")
     if last.done:
         console.print(
@@ -117,10 +117,10 @@ def status(
         console.print(f"  {env_id}: {done[env_id]} of {planned}")
     for one in standings:
         if one.status in (RUNNING, STOPPED):
-            console.print(f"{one.status}: {one.cell.name}, {one.steps} steps", markup=False)
+            console.print(f"{one.status}: {one.cell.name}, {one.steps} steps")
         if one.status == FAILED:
             why = one.reason or f"see {one.cell.errors(store)}"
-            console.print(f"failed: {one.cell.name}; {why}", markup=False, soft_wrap=True)
+            console.print(f"failed: {one.cell.name}; {why}", soft_wrap=True)
 
 
 @studies.command()

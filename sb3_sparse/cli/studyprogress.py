@@ -30,7 +30,7 @@ class StudyProgress:
             self.bar = Bars(
                 BarColumn(bar_width=30),
                 MofNCompleteColumn(),
-                TextColumn("runs, {task.fields[status]}"),
+                TextColumn("runs, {task.fields[status]}", markup=False),
                 console=self.console,
                 disable=not self.console.is_terminal,
             )
@@ -38,12 +38,12 @@ class StudyProgress:
             self.console.print(f"{progress.done} of {progress.planned} runs are done already")
             self.bar.start()
         for name in progress.retried[self.retried :]:
-            self.console.print(f"failed, tried again at the end: {name}", markup=False)
+            self.console.print(f"failed, tried again at the end: {name}")
         self.retried = len(progress.retried)
         if progress.ended is not None:
             done = f"{progress.done} of {progress.planned}"
             line = f"{done}: {progress.ended}; {time_left(progress)}"
-            self.console.print(line, markup=False, soft_wrap=True)
+            self.console.print(line, soft_wrap=True)
         status = f"{progress.running} running, {len(progress.failed)} failed, {time_left(progress)}"
         self.bar.update(self.task, completed=progress.done, status=status)
 

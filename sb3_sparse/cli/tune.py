@@ -192,8 +192,8 @@ def _print_outcome(run: Run, tuned: Tuned, storage: str | None, log_folder: Path
 
 
 def _say(text: str) -> None:
-    """A line as it is: names may hold what Rich would take for markup."""
-    console.print(text, markup=False, soft_wrap=True)
+    """A line as it is, however long."""
+    console.print(text, soft_wrap=True)
 
 
 @tuning.command()

@@ -34,7 +34,7 @@ class TuningProgress:
         self.bar = Progress(
             BarColumn(bar_width=30),
             MofNCompleteColumn(),
-            TextColumn("trials, {task.fields[status]}"),
+            TextColumn("trials, {task.fields[status]}", markup=False),
             TimeElapsedColumn(),
             console=console,
             disable=not console.is_terminal,
@@ -50,7 +50,7 @@ class TuningProgress:
         for trial in over:
             if trial.number not in self.seen:
                 self.seen.add(trial.number)
-                self.console.print(self._line(trial, standing), markup=False, soft_wrap=True)
+                self.console.print(self._line(trial, standing), soft_wrap=True)
         best = standing.best
         status = "best –" if best is None else f"best {best.values[0]:.6g} (trial {best.number})"
         running = f"{len(standing.running)} running, {status}"

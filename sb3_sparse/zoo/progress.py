@@ -35,7 +35,7 @@ class TrainingProgress(BaseCallback):
         self.progress = Progress(
             BarColumn(bar_width=30),
             MofNCompleteColumn(),
-            TextColumn("steps, {task.fields[status]}"),
+            TextColumn("steps, {task.fields[status]}", markup=False),
             TimeRemainingColumn(),
             console=console,
             disable=not console.is_terminal,
