@@ -11,7 +11,7 @@ import torch as th
 from torch import nn
 from torch.nn import functional
 
-from sb3_sparse.export.graph import Activation, Affine, Clip, Node, Slopes
+from sb3_sparse.export.nodes import Activation, Affine, Clip, Node, Slopes
 
 Make = Callable[[int, tuple[int, ...]], Node]
 """Makes a node of the value that it takes and that value's shape."""

@@ -25,7 +25,7 @@ from sb3_sparse.export.c import write_c
 from sb3_sparse.export.dense import write_dense
 from sb3_sparse.export.graph import Graph
 from sb3_sparse.export.npz import write_npz
-from sb3_sparse.export.observations import Observations, count_of
+from sb3_sparse.export.observations import Observations, count_of, row_of
 from sb3_sparse.export.parity import Actor
 from sb3_sparse.export.units import sort_units
 from sb3_sparse.policies.compiled import unwrapped
@@ -70,9 +70,13 @@ def numpy_artifact(graph: Graph) -> Artifact:
     def actor() -> Actor:
         policy: Any = numpy_policy.Policy(io.BytesIO(content))  # type: ignore[no-untyped-call]
 
-        def run(observations: NDArray[Any]) -> NDArray[Any]:
-            actions = policy(observations).reshape(len(observations), -1)
-            actions[0] = np.reshape(policy(observations[0]), -1)  # one alone is served as well
+        def run(observations: Observations) -> NDArray[Any]:
+            count = count_of(observations)
+            if not graph.parts:
+                observations = np.reshape(observations, (count, *graph.observation_shape))
+            actions = policy(observations).reshape(count, -1)
+            first = row_of(observations, 0)
+            actions[0] = np.reshape(policy(first), -1)  # one alone is served as well
             return np.asarray(actions)
 
         return run
@@ -82,7 +86,7 @@ def numpy_artifact(graph: Graph) -> Artifact:
 
 def onnx_artifact(graph: Graph, version: str) -> Artifact:
     """An ONNX model."""
-    from sb3_sparse.export.onnx_model import write_onnx
+    from sb3_sparse.export.onnx_model import inputs_of, write_onnx
 
     content = write_onnx(graph, version)
 
@@ -92,11 +96,15 @@ def onnx_artifact(graph: Graph, version: str) -> Artifact:
         except ImportError as error:
             raise MissingExtra("checking an ONNX model", "export") from error
         session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
-        kind = np.uint8 if graph.images else np.float32
 
-        def run(observations: NDArray[Any]) -> NDArray[Any]:
-            (actions,) = session.run(None, {"obs": observations.astype(kind)})
-            return np.asarray(actions).reshape(len(observations), -1)
+        def run(observations: Observations) -> NDArray[Any]:
+            given = observations if graph.parts else {"obs": observations}
+            inputs = {}
+            for name, shape, pixels in inputs_of(graph):
+                kind = np.uint8 if pixels else np.float32
+                inputs[name] = np.reshape(given[name], (-1, *shape)).astype(kind)
+            (actions,) = session.run(None, inputs)
+            return np.asarray(actions).reshape(count_of(observations), -1)
 
         return run
 
@@ -188,8 +196,8 @@ def compiled(source: str, graph: Graph, options: tuple[str, ...] = OPTIONS) -> A
     function.argtypes, function.restype = [numbers, numbers], None
     count = graph.nodes[-1].shape[0]
 
-    def run(observations: NDArray[Any]) -> NDArray[Any]:
-        rows = np.ascontiguousarray(observations.reshape(len(observations), -1), np.float32)
+    def run(observations: Observations) -> NDArray[Any]:
+        rows = np.ascontiguousarray(graph.rows(observations).reshape(count_of(observations), -1))
         actions = np.empty((len(rows), count), np.float32)
         for row, action in zip(rows, actions, strict=True):
             function(row.ctypes.data_as(numbers), action.ctypes.data_as(numbers))

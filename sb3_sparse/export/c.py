@@ -10,27 +10,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_sparse.export import ckernels
-from sb3_sparse.export.graph import (
+from sb3_sparse.export.cheader import PROTOTYPE, WIDTH, about, declarations
+from sb3_sparse.export.graph import Graph
+from sb3_sparse.export.layout import grouped, side_by_side
+from sb3_sparse.export.memory import Memory, bordered_shape, plan_memory
+from sb3_sparse.export.nodes import (
     Activation,
     Add,
     Argmax,
+    Concat,
     Conv,
     Flatten,
-    Graph,
     Linear,
     MaxPool,
     Node,
     Normalize,
+    OneHot,
     PerUnit,
     Positive,
+    Slice,
     Weighted,
 )
-from sb3_sparse.export.layout import grouped, side_by_side
-from sb3_sparse.export.memory import Memory, bordered_shape, plan_memory
 from sb3_sparse.export.quantize import quantize_rows
 
-PROTOTYPE = "void sb3_sparse_policy(const float *obs, float *action)"
-WIDTH = 100
 BYTES = {"float": 4, "int8_t": 1, "uint16_t": 2, "uint32_t": 4}
 
 
@@ -65,14 +67,7 @@ def write_c(graph: Graph, version: str, int8: bool = False) -> CSource:
     body = "\n".join(f"    {line}" for line in writer.calls)
     ram = 4 * writer.memory.size
     memory = f"static float memory[{writer.memory.size}];\n\n" if ram else ""
-    observations, actions = int(np.prod(graph.observation_shape)), graph.nodes[-1].shape[0]
-    about = [
-        f"A policy of {graph.nnz} connections, written by sb3_sparse {version}.",
-        f"Flash: {writer.flash} bytes of constants, and the code. RAM: {ram} bytes, no heap.",
-        f"In: one observation of {_shape(graph.observation_shape)}, raw.",
-        f"Out: {_what(graph, actions)}.",
-    ]
-    comment = "/*\n" + "".join(f" * {line}\n" for line in about) + " */\n"
+    comment = about(graph, version, writer.flash, ram)
     includes = "#include <stdint.h>\n"
     if any(f"{name}(" in functions for name in ckernels.MATH):
         includes = "#include <math.h>\n" + includes
@@ -80,15 +75,7 @@ def write_c(graph: Graph, version: str, int8: bool = False) -> CSource:
         f"{comment}{includes}\n{PROTOTYPE};\n\n{memory}{functions}\n{tables}\n\n"
         f"{PROTOTYPE}\n{{\n{body}\n}}\n"
     )
-    header = (
-        f"{comment}#ifndef SB3_SPARSE_POLICY_H\n#define SB3_SPARSE_POLICY_H\n\n"
-        f"#define SB3_SPARSE_OBSERVATION_SIZE {observations}\n"
-        f"#define SB3_SPARSE_ACTION_SIZE {actions}\n\n"
-        '#ifdef __cplusplus\nextern "C" {\n#endif\n\n'
-        "/* Not reentrant: its intermediate values are static. */\n"
-        f"{PROTOTYPE};\n\n"
-        "#ifdef __cplusplus\n}\n#endif\n\n#endif\n"
-    )
+    header = comment + declarations(graph)
     return CSource(source, header, writer.flash, ram)
 
 
@@ -118,6 +105,17 @@ class _Writer:
             self.functions["argmax"] = ckernels.ARGMAX
             sizes = self._table("sizes", node.sizes, "uint32_t")
             self.calls.append(f"argmax({x}, {y}, {len(node.sizes)}, {sizes});")
+        elif isinstance(node, OneHot):
+            self.functions["one_hot"] = ckernels.ONE_HOT
+            sizes = self._table("sizes", node.sizes, "uint32_t")
+            self.calls.append(f"one_hot({x}, {y}, {len(node.sizes)}, {sizes});")
+        elif isinstance(node, Concat):
+            self.functions["copy_each"] = ckernels.COPY
+            start = 0
+            for part in node.inputs:
+                size = int(np.prod(self.graph.shape_of(part)))
+                self.calls.append(f"copy_each({self._place(part)}, {y} + {start}, {size});")
+                start += size
         elif isinstance(node, PerUnit):
             places = int(np.prod(node.shape[1:]))
             self._elementwise(node, x, y, f"{node.shape[0]}, {places}", node.fields())
@@ -132,7 +130,7 @@ class _Writer:
         elif isinstance(node, Positive):
             self._elementwise(node, x, y, _size(node), {})
         else:
-            assert isinstance(node, Flatten)  # the same numbers in the same order
+            assert isinstance(node, (Flatten, Slice))  # the same numbers in the same order
 
     def _elementwise(
         self, node: Node, x: str, y: str, size: str, fields: dict[str, NDArray[Any]]
@@ -244,8 +242,10 @@ class _Writer:
             return "obs"
         if value == len(self.graph.nodes):
             return "action"
-        if value not in self.memory.places:  # an observation that was only flattened
-            return self._place(self.graph.nodes[value - 1].inputs[0])
+        if value not in self.memory.places:  # an observation, or a part of it, perhaps flattened
+            node = self.graph.nodes[value - 1]
+            before = self._place(node.inputs[0])
+            return f"{before} + {node.start}" if isinstance(node, Slice) else before
         return f"memory + {self.memory.places[value]}"
 
     def _table(self, name: str, numbers: Any, kind: str) -> str:
@@ -273,17 +273,3 @@ def _number(value: Any) -> str:
 
 def _size(node: Node) -> str:
     return str(int(np.prod(node.shape)))
-
-
-def _shape(shape: tuple[int, ...]) -> str:
-    return "x".join(map(str, shape))
-
-
-def _what(graph: Graph, actions: int) -> str:
-    last = graph.nodes[-1]
-    if isinstance(last, Argmax):
-        choices = ", ".join(map(str, last.sizes))
-        return f"{actions} whole number{'s' * (actions > 1)}, below {choices}"
-    if isinstance(last, Positive):
-        return f"{actions} times 0 or 1"
-    return f"{actions} number{'s' * (actions > 1)}, within the action space's bounds"

@@ -174,6 +174,23 @@ static void max_pool(const float *x, float *y, uint32_t units, uint32_t height, 
             }
 }
 """
+COPY = """\
+static void copy_each(const float *x, float *y, uint32_t n)
+{
+    uint32_t i;
+    for (i = 0; i < n; i++)
+        y[i] = x[i];
+}
+"""
+ONE_HOT = """\
+static void one_hot(const float *x, float *y, uint32_t n, const uint32_t *size)
+{
+    uint32_t i;
+    for (; n; n--, x++, size++)
+        for (i = 0; i < *size; i++)
+            *y++ = *x == (float)i ? 1.0f : 0.0f;
+}
+"""
 ARGMAX = """\
 static void argmax(const float *x, float *y, uint32_t n, const uint32_t *size)
 {

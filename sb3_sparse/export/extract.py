@@ -9,20 +9,13 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.distributions import StateDependentNoiseDistribution
-from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
 from sb3_sparse.errors import CorruptStateError, UnsupportedError
-from sb3_sparse.export.graph import (
-    Affine,
-    Argmax,
-    Clip,
-    Graph,
-    Linear,
-    Normalize,
-    Positive,
-)
+from sb3_sparse.export.graph import Graph
+from sb3_sparse.export.nodes import Affine, Argmax, Clip, Linear, Positive
+from sb3_sparse.export.preprocess import observed, preprocessed
 from sb3_sparse.export.trace import Tracer
 from sb3_sparse.loading.zips import check_finite
 from sb3_sparse.policies.aliases import supported_algorithms
@@ -39,56 +32,39 @@ def graph_of(model: BaseAlgorithm, normalization: VecNormalize | None) -> Graph:
     """
     policy: Any = unwrapped(model.policy)
     policy.set_training_mode(False)
-    space = check_observations(model.observation_space)
-    tracer = Tracer(space.shape, {id(module): name for name, module in policy.named_modules()})
-    value = 0
-    if normalization is not None:
-        value = _normalize(tracer, normalization)
-    images = is_image_space(space)
-    if images and policy.normalize_images:
-        value = tracer.add(_scaled(value, space.shape, 1.0 / 255.0, 0.0))
+    space = model.observation_space
+    seen = observed(space)
+    tracer = Tracer(seen.shape, {id(module): name for name, module in policy.named_modules()})
+    value = preprocessed(tracer, space, normalization, policy.normalize_images)
     try:
-        modules = _modules(policy)
+        extractor, *modules = _modules(policy)
     except AttributeError as error:
         raise UnsupportedError(
             f"{type(policy).__name__} is not built as SB3's own policies are ({error}), so it "
             "cannot be exported"
         ) from error
+    result = tracer.walk(extractor, value)
     for module in modules:
-        value = tracer.walk(module, value)
+        result = tracer.walk(module, result)
     action = model.action_space
     if _quantiles(policy):
-        value = _mean_quantiles(tracer, value, _quantiles(policy))
+        result = _mean_quantiles(tracer, result, _quantiles(policy))
     if isinstance(action, spaces.Box):
-        _box(tracer, value, policy, action)
+        _box(tracer, result, policy, action)
     elif isinstance(action, spaces.Discrete):
-        tracer.add(Argmax((value,), (1,), (int(action.n),)))
+        tracer.add(Argmax((result,), (1,), (int(action.n),)))
     elif isinstance(action, spaces.MultiDiscrete) and action.nvec.ndim == 1:
         sizes = tuple(int(n) for n in action.nvec)
-        tracer.add(Argmax((value,), (len(sizes),), sizes))
+        tracer.add(Argmax((result,), (len(sizes),), sizes))
     elif isinstance(action, spaces.MultiBinary):
-        tracer.add(Positive((value,), tracer.shape_of(value)))
+        tracer.add(Positive((result,), tracer.shape_of(result)))
     else:
         raise UnsupportedError(
             f"actions in {action} cannot be exported; allowed are Box, Discrete, MultiDiscrete "
             "(of one axis) and MultiBinary"
         )
     shape = action.shape or ()
-    return Graph(space.shape, tracer.finish(), tuple(shape), images)
-
-
-def check_observations(space: spaces.Space[Any]) -> spaces.Box | spaces.MultiBinary:
-    """The observation space, if its observations are numbers that a policy takes as they are.
-
-    :raises UnsupportedError: if not
-    """
-    if not isinstance(space, (spaces.Box, spaces.MultiBinary)):
-        raise UnsupportedError(
-            f"a policy of observations in {space} cannot be exported; allowed are Box (vectors and "
-            "images) and MultiBinary. Others can be made vectors before training, by gymnasium's "
-            "wrapper FlattenObservation"
-        )
-    return space
+    return Graph(seen.shape, tracer.finish(), tuple(shape), seen.pixels, seen.parts)
 
 
 def check_model(model: BaseAlgorithm) -> None:
@@ -182,17 +158,3 @@ def span_of(model: BaseAlgorithm) -> NDArray[np.float64]:
     if not (isinstance(space, spaces.Box) and unwrapped(model.policy).squash_output):
         return np.zeros(1)
     return (space.high.reshape(-1).astype(np.float64) - space.low.reshape(-1)) / 2.0
-
-
-def _scaled(value: int, shape: tuple[int, ...], scale: float, shift: float) -> Affine:
-    units = np.ones(shape[0], np.float32)
-    return Affine((value,), shape, units * np.float32(scale), units * np.float32(shift))
-
-
-def _normalize(tracer: Tracer, normalization: VecNormalize) -> int:
-    """VecNormalize's view of an observation."""
-    rms = normalization.obs_rms
-    assert not isinstance(rms, dict)  # of a space that check_observations refuses
-    shape = tracer.observation_shape
-    scale = 1.0 / np.sqrt(rms.var + normalization.epsilon)
-    return tracer.add(Normalize((0,), shape, rms.mean, scale, float(normalization.clip_obs)))

@@ -9,14 +9,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_sparse.export.graph import Affine, Conv, Graph, Node, Weighted
+from sb3_sparse.export.graph import Graph
+from sb3_sparse.export.nodes import Affine, Conv, Node, Weighted
 
 
 def fold(graph: Graph) -> Graph:
     """A graph without the :class:`Affine` nodes that a neighbouring layer can do the work of.
 
-    Batch normalisation and the division of pixels by 255 disappear so.
+    Batch normalisation and the division of pixels by 255 disappear so, and values nobody reads.
     """
+    for number in range(len(graph.nodes) - 1):
+        if not graph.users(number + 1):
+            return fold(rewrite(graph, {number: None}))
     for number, node in enumerate(graph.nodes):
         if isinstance(node, Affine):
             changed = _into_producer(graph, number, node) or _into_users(graph, number, node)

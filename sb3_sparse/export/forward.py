@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import operator
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,7 +11,7 @@ import torch as th
 from torch import fx, nn
 
 from sb3_sparse.export.activations import called, scaled
-from sb3_sparse.export.graph import Add
+from sb3_sparse.export.nodes import Add
 
 if TYPE_CHECKING:
     from sb3_sparse.export.trace import Tracer
@@ -21,11 +22,12 @@ MULTIPLY = (operator.mul, operator.imul, th.mul, "mul", "mul_")
 DIVIDE = (operator.truediv, operator.itruediv, th.div, "div", "div_")
 NEGATE = (operator.neg, th.neg, "neg")
 IN_PLACE = (operator.iadd, operator.isub, operator.imul, operator.itruediv)
+CONCAT = (th.cat, th.concat, th.concatenate)
 RESHAPE = ("view", "reshape", th.reshape)
 
 
-def trace_forward(tracer: Tracer, module: nn.Module, value: int) -> int:
-    """The result of a module applied to a value.
+def trace_forward(tracer: Tracer, module: nn.Module, value: int | Mapping[str, int]) -> int:
+    """The result of a module applied to a value, or to a dict of values.
 
     :raises UnsupportedError: if its ``forward`` does what cannot be exported
     """
@@ -34,14 +36,20 @@ def trace_forward(tracer: Tracer, module: nn.Module, value: int) -> int:
     except Exception as error:  # whatever a forward does that cannot be traced
         raise tracer.refusal(module, f"its forward cannot be traced ({error})") from error
     values: dict[fx.Node, int] = {}
+    observation: fx.Node | None = None
     sizes: set[fx.Node] = set()
     """What stands for the size of a batch, or for a shape, whose first number that is."""
     for node in graph.nodes:
         taken = [values.get(arg) for arg in node.all_input_nodes]
         first = taken[0] if taken else None
         found = None
-        if node.op == "placeholder" and not values:
+        if node.op == "placeholder" and observation is None:
+            observation = node
+            if not isinstance(value, int):
+                continue
             found = value
+        elif node.target is operator.getitem and node.args[0] is observation:
+            found = None if isinstance(value, int) else value.get(str(node.args[1]))
         elif node.op == "output" and node.args[0] in values:
             return values[node.args[0]]
         elif node.op == "call_module" and len(taken) == 1 and first is not None:
@@ -72,6 +80,8 @@ def _call(
     arguments = list(node.args)
     options = dict(node.kwargs)
     inputs = [values[arg] for arg in arguments if isinstance(arg, fx.Node) and arg in values]
+    if target in CONCAT:
+        return _concat(tracer, arguments, options, values)
     in_place = options.pop("inplace", False) or target in IN_PLACE or str(target).endswith("_")
     if in_place:
         tracer.changed.update(tracer.sources(inputs[0]))
@@ -92,6 +102,21 @@ def _call(
         return value
     made = called(target, arguments[1:], options)
     return None if made is None else tracer.walk(made, value)
+
+
+def _concat(
+    tracer: Tracer, arguments: list[Any], options: dict[str, Any], values: dict[fx.Node, int]
+) -> int | None:
+    """Values behind each other, if they are so along the first axis of an observation."""
+    parts, *rest = arguments
+    axis = options.get("dim", rest[0] if rest else 0)
+    if not isinstance(parts, (list, tuple)) or any(part not in values for part in parts):
+        return None
+    found = [values[part] for part in parts]
+    shapes = [tracer.shape_of(value) for value in found]
+    if axis not in (1, -len(shapes[0])) or len({shape[1:] for shape in shapes}) > 1:
+        return None
+    return tracer.concat(found)
 
 
 def _arithmetic(target: Any, arguments: list[Any]) -> tuple[float, float] | None:

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sb3_sparse.export.graph import Activation, Conv, Flatten, Graph, MaxPool, Node, PerUnit
+from sb3_sparse.export.graph import Graph
+from sb3_sparse.export.nodes import Activation, Conv, Flatten, MaxPool, Node, PerUnit, Slice
 
 IN_PLACE = (Activation, PerUnit)
 """Nodes that may write over their input."""
@@ -46,7 +47,7 @@ def plan_memory(graph: Graph) -> Memory:
     for value, node in enumerate(graph.nodes, start=1):
         before = node.inputs[0]
         in_place = isinstance(node, IN_PLACE) and home[before] and _read_once(graph, before)
-        if isinstance(node, Flatten) or in_place:
+        if isinstance(node, (Flatten, Slice)) or in_place:
             home[value] = home[before] if value != last_value else value
         for taken in node.inputs:
             last_use[home[taken]] = value

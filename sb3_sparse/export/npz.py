@@ -8,12 +8,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_sparse.export.graph import Graph, Node, Weighted
+from sb3_sparse.export.graph import Graph
+from sb3_sparse.export.nodes import Node, Weighted
 
 
 def write_npz(graph: Graph) -> bytes:
     """Bytes of the file: all nodes' names and inputs, and each one's ``<number>.<array>``."""
-    inputs = np.zeros((len(graph.nodes), 2), np.int32)
+    most = max(len(node.inputs) for node in graph.nodes)
+    inputs = np.zeros((len(graph.nodes), most), np.int32)
     for row, node in zip(inputs, graph.nodes, strict=True):
         row[:] = -1  # no input
         row[: len(node.inputs)] = node.inputs
@@ -22,6 +24,8 @@ def write_npz(graph: Graph) -> bytes:
         "inputs": inputs,
         "observation": np.array(graph.observation_shape, np.int64),
         "action": np.array(graph.action_shape, np.int64),
+        "keys": np.array([part.key for part in graph.parts], np.str_),
+        "axes": np.array([len(part.shape) for part in graph.parts], np.int64),
     }
     for number, node in enumerate(graph.nodes):
         arrays.update({f"{number}.{name}": field for name, field in _fields(node).items()})

@@ -53,16 +53,20 @@ OPERATIONS = {  # of a node's arrays and its inputs, whose last axis is the batc
     ).reshape(-1, *w.shape[3:]),
     "max_pool": lambda n, x: windows(n, x, -np.inf).max((1, 2)),
     "flatten": lambda n, x: x.reshape(-1, x.shape[-1]),
+    "slice": lambda n, x: x[slice(*n["range"])].reshape(*n["shape"], x.shape[-1]),
+    "one_hot": lambda n, x: (np.repeat(x, n["sizes"], 0) == n["values"]).astype(np.float32),
+    "concat": lambda n, *x: np.concatenate(x),
     "add": lambda n, x, y: x + y,
     "argmax": lambda n, x: np.stack([p.argmax(0) for p in np.split(x, n["splits"])]),
     "positive": lambda n, x: (x > 0).astype(np.int64),
 }
 
 
-class Policy:  # takes one observation, or many: one a row
+class Policy:  # takes one observation, or many: one a row; or a dict of them
     def __init__(self, path):
         with np.load(path) as file:
             self.shapes, self.nodes = (file["observation"], file["action"]), []
+            self.parts = list(zip(file["keys"], file["axes"]))
             for i, (op, inputs) in enumerate(zip(file["ops"], file["inputs"])):
                 n = {k.split(".")[1]: file[k] for k in file.files if k.startswith(f"{i}.")}
                 if "data" in n:
@@ -70,6 +74,10 @@ class Policy:  # takes one observation, or many: one a row
                 self.nodes.append((OPERATIONS[op], n, inputs[inputs >= 0]))
 
     def __call__(self, observation):
+        if self.parts:
+            parts = [(np.asarray(observation[key], np.float32), axes) for key, axes in self.parts]
+            rows = [x.reshape(*x.shape[: x.ndim - axes], -1) for x, axes in parts]
+            observation = np.concatenate(rows, -1)
         x = np.asarray(observation, np.float32)
         values = [np.moveaxis(x.reshape(-1, *self.shapes[0]), 0, -1)]
         for operation, n, inputs in self.nodes:

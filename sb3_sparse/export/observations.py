@@ -173,6 +173,30 @@ def _check_part(part: Any, space: spaces.Space[Any], what: str) -> None:
         raise ConfigError(f"{what} must be finite; some are NaN or infinite")
 
 
+def check_statistics(space: spaces.Space[Any], normalization: VecNormalize) -> None:
+    """Refuse statistics of other observations than the policy takes.
+
+    :raises ConfigError: if so
+    """
+    rms: Any = normalization.obs_rms
+    parts = space.spaces if isinstance(space, spaces.Dict) else None
+    if isinstance(rms, dict):
+        fits = parts is not None and all(
+            key in parts and known.mean.shape == parts[key].shape for key, known in rms.items()
+        )
+        seen = f"a dict of shapes { {key: known.mean.shape for key, known in rms.items()} }"
+    else:
+        fits = parts is None and rms.mean.shape == space.shape
+        seen = f"observations of shape {rms.mean.shape}"
+    if not fits:
+        taken = f"those in {space}" if parts is not None else f"shape {space.shape}"
+        raise ConfigError(
+            f"the statistics are of {seen}, the policy takes {taken}. Give those of the same "
+            "run; if its frames were stacked after normalisation, it can be exported as 'dense' "
+            "only, since no raw observation stands for the empty frames of a beginning"
+        )
+
+
 def has_images(space: spaces.Space[Any]) -> bool:
     """Whether a space is one of images, or has one in it."""
     parts = space.spaces.values() if isinstance(space, spaces.Dict) else [space]
@@ -186,6 +210,13 @@ def count_of(observations: Observations | None) -> int:
     if isinstance(observations, dict):
         return len(next(iter(observations.values())))
     return len(observations)
+
+
+def row_of(observations: Observations, number: int) -> Observations:
+    """One of the observations, by itself."""
+    if isinstance(observations, dict):
+        return {key: part[number] for key, part in observations.items()}
+    return observations[number]
 
 
 def rows_of(observations: Observations, first: int, last: int) -> Observations:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Protocol
 
-from sb3_sparse.export.graph import Activation
+from sb3_sparse.export.nodes import Activation
 
 
 class Writer(Protocol):

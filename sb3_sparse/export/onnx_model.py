@@ -8,19 +8,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_sparse.errors import MissingExtra
-from sb3_sparse.export.graph import (
+from sb3_sparse.export.graph import Graph
+from sb3_sparse.export.nodes import (
     Activation,
     Add,
     Affine,
     Argmax,
     Clip,
+    Concat,
     Conv,
     Flatten,
-    Graph,
     Linear,
     MaxPool,
     Node,
     Normalize,
+    OneHot,
+    Slice,
     Slopes,
 )
 from sb3_sparse.export.onnx_activations import write_activation
@@ -37,25 +40,30 @@ IR_VERSION = 8
 def write_onnx(graph: Graph, version: str) -> bytes:
     """Bytes of a model with one input, ``obs``, and one output, ``action``, both batched.
 
-    Images are uint8, other observations float32; actions are float32, or int64 where they are
-    whole numbers. Weights are dense: ONNX runtimes compute no sparse products.
+    Observations that are dicts have an input for each key, by its name. Images are uint8, other
+    observations float32; actions are float32, or int64 where they are whole numbers. Weights are
+    dense: ONNX runtimes compute no sparse products.
 
     :param version: of this package, for the model's producer
     """
     writer = _Writer()
-    if graph.images:
+    if graph.parts:
+        rows = [
+            writer.row(f"{part.key}_row", part.key, part.size, part.pixels) for part in graph.parts
+        ]
+        writer.node("Concat", rows, "value_0", axis=1)
+    elif graph.images:
         writer.node("Cast", ["obs"], "value_0", to=TensorProto.FLOAT)
     for value, node in enumerate(graph.nodes, start=1):
         inputs = [_name(taken, graph) for taken in node.inputs]
         writer.write(node, inputs, f"value_{value}")
     last = f"value_{len(graph.nodes)}"
     writer.node("Reshape", [last, writer.array([-1, *graph.action_shape], np.int64)], "action")
-    pixels = TensorProto.UINT8 if graph.images else TensorProto.FLOAT
     numbers = TensorProto.INT64 if graph.discrete else TensorProto.FLOAT
     made = helper.make_graph(
         writer.nodes,
         "policy",
-        [helper.make_tensor_value_info("obs", pixels, ["batch", *graph.observation_shape])],
+        [_input(*asked) for asked in inputs_of(graph)],
         [helper.make_tensor_value_info("action", numbers, ["batch", *graph.action_shape])],
         writer.arrays,
     )
@@ -71,8 +79,20 @@ def write_onnx(graph: Graph, version: str) -> bytes:
     return written
 
 
+def inputs_of(graph: Graph) -> list[tuple[str, tuple[int, ...], bool]]:
+    """Name and shape of each input of the model, and whether it is of uint8."""
+    if not graph.parts:
+        return [("obs", graph.observation_shape, graph.images)]
+    return [(part.key, part.shape or (1,), part.pixels) for part in graph.parts]
+
+
+def _input(name: str, shape: tuple[int, ...], pixels: bool) -> Any:
+    kind = TensorProto.UINT8 if pixels else TensorProto.FLOAT
+    return helper.make_tensor_value_info(name, kind, ["batch", *shape])
+
+
 def _name(value: int, graph: Graph) -> str:
-    return "obs" if value == 0 and not graph.images else f"value_{value}"
+    return "obs" if value == 0 and not graph.images and not graph.parts else f"value_{value}"
 
 
 class _Writer:
@@ -92,6 +112,12 @@ class _Writer:
         name = f"constant_{len(self.arrays)}"
         self.arrays.append(numpy_helper.from_array(np.asarray(values, kind), name))
         return name
+
+    def row(self, output: str, x: str, size: int, pixels: bool) -> str:
+        """Append what makes one row of an input; its name."""
+        if pixels:
+            x = self.node("Cast", [x], f"{output}_float", to=TensorProto.FLOAT)
+        return self.node("Reshape", [x, self.array([-1, size], np.int64)], output)
 
     def write(self, node: Node, inputs: list[str], output: str) -> None:
         """Append what computes a node of the graph."""
@@ -132,11 +158,27 @@ class _Writer:
             self.node("Flatten", inputs, output)
         elif isinstance(node, Add):
             self.node("Add", inputs, output)
+        elif isinstance(node, Concat):
+            self.node("Concat", inputs, output, axis=1)
+        elif isinstance(node, Slice):
+            (start, stop), shape = node.fields().values()
+            ends = [self.array([end], np.int64) for end in (start, stop, 1)]
+            part = self.node("Slice", [*inputs, *ends], f"{output}_row")
+            self.node("Reshape", [part, self.array([-1, *shape], np.int64)], output)
+        elif isinstance(node, OneHot):
+            self._one_hot(node, inputs[0], output)
         elif isinstance(node, Argmax):
             self._argmax(node, inputs[0], output)
         else:
             positive = self.node("Greater", [*inputs, self.array(0.0)], f"{output}_positive")
             self.node("Cast", [positive], output, to=TensorProto.INT64)
+
+    def _one_hot(self, node: OneHot, x: str, output: str) -> None:
+        columns = self.array(np.repeat(np.arange(len(node.sizes)), node.sizes), np.int64)
+        each = self.node("Gather", [x, columns], f"{output}_each", axis=1)
+        values = self.array(node.fields()["values"].T)
+        same = self.node("Equal", [each, values], f"{output}_same")
+        self.node("Cast", [same], output, to=TensorProto.FLOAT)
 
     def _argmax(self, node: Argmax, scores: str, output: str) -> None:
         parts = [f"{output}_part_{i}" for i in range(len(node.sizes))]

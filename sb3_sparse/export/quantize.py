@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_sparse.export.graph import Floats, Graph, Weighted
+from sb3_sparse.export.graph import Graph
+from sb3_sparse.export.nodes import Floats, Weighted
 
 LARGEST = 127
 SMALLEST = 1e-30

@@ -15,8 +15,9 @@ from sb3_sparse.engine.sequential import ChainedSequential
 from sb3_sparse.errors import UnsupportedError
 from sb3_sparse.export.activations import NAMES, nodes_of
 from sb3_sparse.export.forward import trace_forward
-from sb3_sparse.export.graph import (
+from sb3_sparse.export.nodes import (
     Affine,
+    Concat,
     Conv,
     Flatten,
     Floats,
@@ -24,6 +25,7 @@ from sb3_sparse.export.graph import (
     MaxPool,
     Node,
     Normalize,
+    Slice,
 )
 from sb3_sparse.policies.compiled import unwrapped
 
@@ -38,7 +40,7 @@ COMPACT = (CompactLinear.forward, ChainedSequential.forward)
 """These compute what torch's do."""
 ALLOWED = (
     f"Linear, Conv2d, MaxPool2d, Flatten, BatchNorm, Dropout, {NAMES}, and modules whose forward "
-    "does nothing but call these, add, flatten, and multiply by numbers"
+    "does nothing but call these, add, flatten, concatenate, and multiply by numbers"
 )
 
 
@@ -65,12 +67,14 @@ class Tracer:
         self.nodes.append(node)
         return len(self.nodes)
 
-    def walk(self, module: nn.Module, value: int) -> int:
-        """The result of a module applied to a value.
+    def walk(self, module: nn.Module, value: int | Mapping[str, int]) -> int:
+        """The result of a module applied to a value, or to a dict of values.
 
         :raises UnsupportedError: if it does what cannot be exported
         """
         module = unwrapped(module)
+        if not isinstance(value, int):
+            return trace_forward(self, module, value)
         if getattr(module, "inplace", False):
             self.changed.update(self.sources(value))
         elementwise = nodes_of(module)
@@ -116,6 +120,24 @@ class Tracer:
         if len(shape) == 1:
             return value
         return self.add(Flatten((value,), (int(np.prod(shape)),)))
+
+    def concat(self, values: list[int]) -> int:
+        """Values behind each other; those of a whole observation are the observation."""
+        shapes = [self.shape_of(value) for value in values]
+        if len(values) == 1:
+            return values[0]
+        start = 0
+        for value in values:
+            source = self.sources(value)[-1]
+            node = self.nodes[source - 1] if source else None
+            if not isinstance(node, Slice) or node.start != start:
+                start = -1
+                break
+            start += int(np.prod(node.shape))
+        if (start,) == self.observation_shape and all(len(shape) == 1 for shape in shapes):
+            return 0
+        units = sum(shape[0] for shape in shapes)
+        return self.add(Concat(tuple(values), (units, *shapes[0][1:])))
 
     def finish(self) -> tuple[Node, ...]:
         """All operations.

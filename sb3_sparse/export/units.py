@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_sparse.export.fold import with_weights
-from sb3_sparse.export.graph import (
+from sb3_sparse.export.graph import Graph
+from sb3_sparse.export.nodes import (
     Activation,
     Add,
+    Concat,
     Conv,
     Flatten,
-    Graph,
     Linear,
     MaxPool,
     Node,
@@ -114,7 +115,7 @@ class _Constants:
                 self.source[value] = self.source[node.inputs[0]]
             if isinstance(node, Weighted):
                 self.known[value] = self._of_layer(node)
-            elif isinstance(node, Add):
+            elif isinstance(node, (Add, Concat)):
                 for operand in node.inputs:
                     self.pinned[self.source[operand]][:] = True
                 self.pinned[value][:] = True

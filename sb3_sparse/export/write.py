@@ -24,10 +24,12 @@ from sb3_sparse.export.artifact import (
 )
 from sb3_sparse.export.extract import check_model, graph_of, span_of
 from sb3_sparse.export.fold import fold
-from sb3_sparse.export.graph import Argmax, Graph
+from sb3_sparse.export.graph import Graph
+from sb3_sparse.export.nodes import Argmax
 from sb3_sparse.export.observations import (
     Observations,
     check_recorded,
+    check_statistics,
     has_images,
     random_observations,
 )
@@ -110,7 +112,7 @@ def export(
     :param vecnormalize: what normalised the observations, or the file it was saved to; None: the
         one in the model's own environment, if there is one
     :param observations: recorded ones to check with, raw, of shape ``(count, *shape)`` as the
-        policy sees them (images channels first); random ones are used besides
+        policy sees them (images channels first), or a dict of such; random ones are used besides
     :param int8: C only: weights as 8-bit numbers with a scale for each row. Parity is then with
         the rounded weights, and what rounding changes in the actions is reported
     :param force: write also what fails the check
@@ -132,7 +134,7 @@ def export(
     if normalization is not None and to == "dense":
         left_out, normalization = True, None  # which happens outside of the zip, as before
     elif normalization is not None:
-        check_statistics(model, normalization)
+        check_statistics(space, normalization)
     if observations is not None:
         check_recorded(observations, space)
     random = random_observations(
@@ -214,21 +216,6 @@ def normalization_of(
     elif not isinstance(given, VecNormalize):
         raise ConfigError(f"vecnormalize must be a VecNormalize or its file, got {given!r}")
     return given if given is not None and given.norm_obs else None
-
-
-def check_statistics(model: BaseAlgorithm, normalization: VecNormalize) -> None:
-    """Refuse statistics of other observations than the policy takes.
-
-    :raises ConfigError: if so
-    """
-    shape, rms = model.observation_space.shape, normalization.obs_rms
-    if isinstance(rms, dict) or rms.mean.shape != shape:
-        seen = "a Dict" if isinstance(rms, dict) else f"observations of shape {rms.mean.shape}"
-        raise ConfigError(
-            f"the statistics are of {seen}, the policy takes shape {shape}. Give those of the same "
-            "run; if its frames were stacked after normalisation, it can be exported as 'dense' "
-            "only, since no raw observation stands for the empty frames of a beginning"
-        )
 
 
 def _connections(model: BaseAlgorithm) -> int:

@@ -14,9 +14,10 @@ from sb3_sparse.export import export
 from sb3_sparse.export.artifact import OPTIONS, compiled
 from sb3_sparse.export.c import write_c
 from sb3_sparse.export.extract import graph_of
-from sb3_sparse.export.graph import Add, Conv, Flatten, Graph
+from sb3_sparse.export.graph import Graph
 from sb3_sparse.export.layout import grouped
 from sb3_sparse.export.memory import plan_memory
+from sb3_sparse.export.nodes import Add, Conv, Flatten
 from sb3_sparse.export.quantize import quantize_rows, quantized
 
 BYTES = {"float": 4, "int8_t": 1, "uint16_t": 2, "uint32_t": 4}

@@ -1,18 +1,27 @@
 """Observations in a dict, of any number of keys, and models of hindsight experience replay."""
 
 import numpy as np
+import onnxruntime
 import pytest
-from export.tools import Task
+import torch as th
+from export.tools import VECTOR, Task
 from gymnasium import spaces
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.envs import BitFlippingEnv
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 from support import make
+from torch import nn
 
 from sb3_sparse import sparsify
-from sb3_sparse.errors import ConfigError
-from sb3_sparse.export import export, record_observations
-from sb3_sparse.export.artifact import predictor
+from sb3_sparse.errors import ConfigError, UnsupportedError
+from sb3_sparse.export import FORMATS, export, record_observations
+from sb3_sparse.export.artifact import compiled, predictor
+from sb3_sparse.export.extract import graph_of
+from sb3_sparse.export.fold import fold
+from sb3_sparse.export.graph import Graph
+from sb3_sparse.export.nodes import Concat, Positive, Slice
+from sb3_sparse.export.numpy_policy import Policy
 from sb3_sparse.policies.saving import load_without_buffer
 
 PARTS = {
@@ -62,15 +71,124 @@ def test_images_among_the_keys(tmp_path):
     assert report.parity.random == 100
     seen = record_observations(model, DummyVecEnv([lambda: model.env.envs[0].unwrapped]), 5)
     assert seen["image"].shape == (5, 1, 36, 36)
-    assert export(model, tmp_path / "dense", "dense", observations=seen).parity.recorded == 5
+    for to in FORMATS:
+        report = export(model, tmp_path / to, to, observations=seen)
+        assert report.parity.holds
+        assert report.parity.recorded == 5
+
+
+@pytest.mark.parametrize("keys", [1, 2, 3, 4, 5])
+@pytest.mark.parametrize("algorithm", ["SAC", "TD3", "DQN", "PPO", "TQC", "QRDQN", "CrossQ"])
+def test_every_other_format_acts_as_the_model(algorithm, keys, tmp_path):
+    action = THREE if algorithm in ("DQN", "QRDQN") else TORQUE
+    model = make(algorithm, Task(dicts(keys), action), policy_kwargs=dict(sparsity=0.6))
+    seen = samples(model.observation_space, 7)
+    for to in ("c", "numpy", "onnx"):
+        report = export(model, tmp_path / "policy", to, observations=seen)
+        assert report.parity.holds
+        assert (report.parity.recorded, report.parity.random) == (7, 1000)
+    assert export(model, tmp_path / "int8", "c", int8=True).parity.holds
+
+
+@pytest.fixture(scope="module")
+def mixed():
+    """Five kinds of parts and an image; the policy, observations and its actions."""
+    space = spaces.Dict({**PARTS, "eye": spaces.Box(0, 255, (36, 36, 3), np.uint8)})
+    model = make("PPO", Task(space, TORQUE), policy_kwargs=dict(sparsity=0.6))
+    model.policy.action_net.weight.data.mul_(50)
+    seen = samples(model.observation_space, 6)
+    return model, seen, model.predict(seen, deterministic=True)[0]
+
+
+def test_numpy_takes_one_dict_or_many(mixed, tmp_path):
+    model, seen, expected = mixed
+    export(model, tmp_path / "policy", "numpy")
+    policy = Policy(tmp_path / "policy.npz")
+    np.testing.assert_allclose(policy(seen), expected, atol=1e-5)
+    one = policy({key: part[2] for key, part in seen.items()})
+    np.testing.assert_allclose(one, expected[2], atol=1e-5)
+    as_it_is = {**seen, "one of five": [int(n) for n in seen["one of five"]]}
+    np.testing.assert_allclose(policy(as_it_is), expected, atol=1e-5)
+
+
+def test_onnx_has_an_input_for_each_key(mixed, tmp_path):
+    model, seen, expected = mixed
+    export(model, tmp_path / "policy", "onnx")
+    session = onnxruntime.InferenceSession(tmp_path / "policy.onnx")
+    asked = {one.name: (one.type, tuple(one.shape)) for one in session.get_inputs()}
+    assert asked["eye"] == ("tensor(uint8)", ("batch", 3, 36, 36))
+    assert asked["one of five"] == ("tensor(float)", ("batch", 1))
+    assert asked["matrix"] == ("tensor(float)", ("batch", 2, 3))
+    given = {key: part.astype(np.float32) for key, part in seen.items()}
+    given |= {"eye": seen["eye"], "one of five": given["one of five"][:, None]}
+    np.testing.assert_allclose(session.run(None, given)[0], expected, atol=1e-5)
+
+
+def test_c_takes_the_parts_behind_each_other_in_the_order_that_it_names(mixed, tmp_path):
+    model, seen, expected = mixed
+    export(model, tmp_path / "policy", "c")
+    text = (tmp_path / "policy.h").read_text().replace("\n * ", " ")
+    order = sorted(model.observation_space.spaces)  # as gymnasium has it
+    assert order == ["choices", "eye", "matrix", "one of five", "switches", "vector"]
+    assert (
+        "3909 numbers: 'choices' (3), then 'eye' (3x36x36), then 'matrix' (2x3), then "
+        "'one of five' (1), then 'switches' (4), then 'vector' (7), raw" in text
+    )
+    assert 3 + 3 * 36 * 36 + 6 + 1 + 4 + 7 == 3909
+    assert "SB3_SPARSE_OBSERVATION_SIZE 3909" in text
+    rows = np.concatenate([seen[key].reshape(6, -1) for key in order], axis=1)
+    act = compiled((tmp_path / "policy.c").read_text(), Graph((3909,), (Positive((0,), (2,)),)))
+    np.testing.assert_allclose(act(rows.astype(np.float32)), expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("to", ["c", "numpy", "onnx", "dense"])
+@pytest.mark.parametrize("algorithm", ["DQN", "PPO", "SAC"])
+@pytest.mark.parametrize("space", [spaces.Discrete(6), spaces.MultiDiscrete([3, 4])], ids=str)
+def test_numbers_of_states_are_one_hot_inside(space, algorithm, to, tmp_path):
+    action = THREE if algorithm == "DQN" else TORQUE
+    model = make(algorithm, Task(space, action), policy_kwargs=dict(sparsity=0.5))
+    assert export(model, tmp_path / "policy", to).parity.holds
+    if to == "numpy":
+        state = 4 if isinstance(space, spaces.Discrete) else np.array([2, 3])
+        expected, _ = model.predict(np.array(state), deterministic=True)
+        np.testing.assert_allclose(
+            Policy(tmp_path / "policy.npz")(state), np.reshape(expected, action.shape), atol=1e-5
+        )
+
+
+class OwnCombination(BaseFeaturesExtractor):
+    """As SB3's documentation shows it, by hand."""
+
+    def __init__(self, observation_space):
+        super().__init__(observation_space, features_dim=8 + 5)
+        self.first = nn.Sequential(nn.Linear(7, 8), nn.GELU())
+
+    def forward(self, observations):
+        vector, one = observations["vector"], observations["one of five"]
+        return th.cat((one, self.first(vector / 2.0)), dim=1)
 
 
 @pytest.mark.parametrize("to", ["c", "numpy", "onnx"])
-def test_other_formats_refuse_dicts_and_say_what_to_do(to, tmp_path):
-    model = make("PPO", Task(dicts(2), TORQUE))
-    with pytest.raises(TypeError, match=r"Dict\(.*cannot be exported.*FlattenObservation"):
-        export(model, tmp_path / "policy", to)
-    assert not list(tmp_path.iterdir())
+def test_a_combination_of_ones_own(to, tmp_path):
+    kwargs = dict(features_extractor_class=OwnCombination)
+    model = make("PPO", Task(dicts(2), TORQUE), "MultiInputPolicy", policy_kwargs=kwargs)
+    assert export(model, tmp_path / "policy", to).parity.holds
+
+
+def test_parts_that_are_passed_on_as_they_are_cost_nothing(tmp_path):
+    space = spaces.Dict({"a": PARTS["vector"], "b": PARTS["switches"], "c": PARTS["matrix"]})
+    model = make("SAC", Task(space, TORQUE))
+    graph = fold(graph_of(model, None))
+    assert graph.observation_shape == (7 + 4 + 6,)
+    assert not [node for node in graph.nodes if isinstance(node, (Slice, Concat))]
+
+
+def test_dicts_that_cannot_be_exported_are_refused(tmp_path):
+    grid = spaces.MultiDiscrete([[2, 3], [4, 5]])
+    model = make("PPO", Task(VECTOR, TORQUE))
+    model.observation_space = spaces.Dict(a=PARTS["vector"], grid=grid)
+    with pytest.raises(UnsupportedError, match=r"MultiDiscrete \(of one axis\)"):
+        export(model, tmp_path / "policy")
 
 
 def test_recorded_dicts_must_be_of_the_policys_keys_shapes_and_rows(tmp_path):
@@ -103,14 +221,24 @@ def test_normalised_and_stacked_dicts(tmp_path):
     model.learn(40)
     seen = record_observations(model, normalised, 10)
     assert np.abs(seen["b"]).max() > 2  # raw
-    report = export(model, tmp_path / "dense", "dense", observations=seen)
-    assert report.parity.holds
-    assert "does not normalise" in str(report)
+    for to in FORMATS:
+        report = export(model, tmp_path / to, to, observations=seen)
+        assert report.parity.holds
+        assert ("does not normalise" in str(report)) == (to == "dense")
+    policy = Policy(tmp_path / "numpy.npz")
+    raw = samples(space, 5)
+    expected, _ = model.predict(normalised.normalize_obs(raw), deterministic=True)
+    np.testing.assert_allclose(policy(raw), expected, atol=1e-5)
+    other = VecNormalize(DummyVecEnv([lambda: Task(dicts(1), TORQUE)]))
+    with pytest.raises(ConfigError, match=r"a dict of shapes .*\(7,\).*those in Dict"):
+        export(model, tmp_path / "other", "c", vecnormalize=other)
     stacked = VecFrameStack(VecNormalize(DummyVecEnv([lambda: Task(space, TORQUE)])), 3)
     model = make("PPO", stacked)
     seen = record_observations(model, stacked, 10)
     assert {key: part.shape for key, part in seen.items()} == {"a": (10, 21), "b": (10, 6)}
     assert export(model, tmp_path / "stacked", "dense", observations=seen).parity.recorded == 10
+    with pytest.raises(ConfigError, match="'dense' only"):
+        export(model, tmp_path / "stacked", "c", observations=seen)
 
 
 def hindsight(algorithm, **arguments):
@@ -129,7 +257,8 @@ def test_models_of_hindsight_experience_replay(algorithm, tmp_path):
     alone = load_without_buffer(type(model), tmp_path / "model.zip")
     assert alone.env is None
     assert alone.replay_buffer is None
-    assert export(alone, tmp_path / "again", "dense").parity.holds
+    for to in FORMATS:
+        assert export(alone, tmp_path / "again", to).parity.holds
     twin = sparsify(alone, 0.95)
     seen = samples(model.observation_space, 3)
     assert twin.predict(seen, deterministic=True)[0].shape[0] == 3

@@ -16,7 +16,7 @@ from support import make
 from torch import nn
 
 from sb3_sparse import SparseActorCriticPolicy
-from sb3_sparse.errors import ConfigError, CorruptStateError, UnsupportedError
+from sb3_sparse.errors import ConfigError, CorruptStateError, Diverged, UnsupportedError
 from sb3_sparse.export import ParityError, export, record_observations
 from sb3_sparse.export.artifact import compiled
 from sb3_sparse.export.extract import graph_of
@@ -87,15 +87,15 @@ def test_statistics_of_another_environment_are_refused(model, tmp_path):
     other = VecNormalize(DummyVecEnv([lambda: gym.make("CartPole-v1")]))
     with pytest.raises(ConfigError, match=r"shape \(4,\), the policy takes shape \(3,\)"):
         export(model, tmp_path / "policy", "c", vecnormalize=other)
-    (tmp_path / "other.pkl").write_bytes(pickle.dumps([1]))
-    with pytest.raises(ConfigError, match="holds list; give what VecNormalize.save wrote"):
-        export(model, tmp_path / "policy", "c", vecnormalize=tmp_path / "other.pkl")
-    (tmp_path / "other.pkl").write_bytes(b"config: 1\nfoo\n")
-    with pytest.raises(ConfigError, match="cannot be read as statistics"):
-        export(model, tmp_path / "policy", "c", vecnormalize=tmp_path / "other.pkl")
-    (tmp_path / "other.pkl").write_bytes(b"no pickle")
-    with pytest.raises(ConfigError, match="cannot be read as statistics"):
-        export(model, tmp_path / "policy", "c", vecnormalize=tmp_path / "other.pkl")
+    contents = {
+        "holds a list where statistics of a VecNormalize should be": pickle.dumps([1]),
+        "other.pkl .*VecNormalize": b"config: 1\nfoo\n",
+        "other.pkl.* .*VecNormalize": b"no pickle",
+    }
+    for message, content in contents.items():
+        (tmp_path / "other.pkl").write_bytes(content)
+        with pytest.raises(CorruptStateError, match=message):
+            export(model, tmp_path / "policy", "c", vecnormalize=tmp_path / "other.pkl")
     assert written(tmp_path) == ["other.pkl"]
 
 
@@ -112,7 +112,7 @@ def test_masks_and_weights_that_disagree_are_refused(tmp_path):
 def test_weights_that_are_not_finite_are_refused(tmp_path):
     model = make("PPO", policy="MlpPolicy")
     model.policy.action_net.bias.data[0] = th.nan
-    with pytest.raises(CorruptStateError, match="action_net.bias has values that are not finite"):
+    with pytest.raises(Diverged, match="values of action_net.bias are not finite"):
         export(model, tmp_path / "policy")
 
 
@@ -120,18 +120,6 @@ def test_other_algorithms_are_refused(tmp_path):
     model = RecurrentPPO("MlpLstmPolicy", "CartPole-v1")
     with pytest.raises(UnsupportedError, match="a model of RecurrentPPO cannot be exported.*SAC"):
         export(model, tmp_path / "policy")
-
-
-@pytest.mark.parametrize("to", ["c", "numpy", "onnx"])
-def test_observations_that_are_no_numbers_are_refused(to, tmp_path):
-    for env in ("TinyDicts-v0", Task(spaces.Discrete(5), spaces.Discrete(2))):
-        with pytest.raises(UnsupportedError, match="allowed are Box.*FlattenObservation"):
-            export(make("PPO", env), tmp_path / "policy", to)
-
-
-def test_dense_zips_take_every_observation(tmp_path):
-    for number, env in enumerate(["TinyDicts-v0", Task(spaces.Discrete(5), spaces.Discrete(2))]):
-        assert export(make("PPO", env), tmp_path / str(number), "dense").parity.holds
 
 
 def test_networks_that_do_anything_else_are_refused(tmp_path):

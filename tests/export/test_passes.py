@@ -7,7 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sb3_sparse.export.fold import fold
-from sb3_sparse.export.graph import Add, Affine, Conv, Flatten, Graph, Linear, MaxPool
+from sb3_sparse.export.graph import Graph
+from sb3_sparse.export.nodes import Add, Affine, Conv, Flatten, Linear, MaxPool
 from sb3_sparse.export.units import remove_dead_units, sort_units, units_of
 
 

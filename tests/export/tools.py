@@ -12,7 +12,8 @@ from gymnasium import spaces
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
-from sb3_sparse.export.graph import Activation, Graph, Linear
+from sb3_sparse.export.graph import Graph
+from sb3_sparse.export.nodes import Activation, Linear
 
 COMPILER = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
 

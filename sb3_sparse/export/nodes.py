@@ -1,0 +1,268 @@
+"""The operations that an exported policy is made of."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_sparse.export.numpy_policy import OPERATIONS
+
+Floats = NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class Node:
+    """An operation.
+
+    :param inputs: values it takes: 0 is the observation, ``i`` the result of node ``i - 1``
+    :param shape: of its result for one observation: ``(units,)`` or ``(units, height, width)``
+    """
+
+    inputs: tuple[int, ...]
+    shape: tuple[int, ...]
+    op: ClassVar[str]
+
+    @property
+    def name(self) -> str:
+        """What the NumPy loader calls it."""
+        return self.op
+
+    def fields(self) -> dict[str, NDArray[Any]]:
+        """What the NumPy loader reads beside name and inputs; the last axis is the batch."""
+        return {}
+
+    def run(self, *inputs: NDArray[Any]) -> NDArray[Any]:
+        """The result for a batch of inputs, whose last axis is the batch."""
+        operation: Any = OPERATIONS[self.name]
+        result: NDArray[Any] = operation(self.fields(), *inputs)
+        return result
+
+
+@dataclass(frozen=True, eq=False)
+class Normalize(Node):
+    """``clip((x - mean) * scale)``, the mean in two floats: it may be far larger than ``x - mean``.
+
+    :param mean: float64, of the input's shape
+    :param scale: float64, one over the standard deviation
+    :param clip: largest absolute value
+    """
+
+    mean: NDArray[np.float64]
+    scale: NDArray[np.float64]
+    clip: float
+    op = "normalize"
+
+    def fields(self) -> dict[str, NDArray[Any]]:
+        mean = self.mean.astype(np.float32)
+        return {
+            "mean": mean[..., None],
+            "rest": (self.mean - mean).astype(np.float32)[..., None],
+            "scale": self.scale.astype(np.float32)[..., None],
+            "clip": np.array([-self.clip, self.clip], np.float32),
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class PerUnit(Node):
+    """Does with each unit what its own numbers say: all fields have shape ``(units,)``."""
+
+    names: ClassVar[tuple[str, ...]]
+
+    def fields(self) -> dict[str, NDArray[Any]]:
+        per_unit = (self.shape[0], *[1] * len(self.shape))
+        return {name: getattr(self, name).reshape(per_unit) for name in self.names}
+
+
+@dataclass(frozen=True, eq=False)
+class Affine(PerUnit):
+    """``x * scale + shift``."""
+
+    scale: Floats
+    shift: Floats
+    op = "affine"
+    names = ("scale", "shift")
+
+
+@dataclass(frozen=True, eq=False)
+class Clip(PerUnit):
+    """Between ``low`` and ``high``."""
+
+    low: Floats
+    high: Floats
+    op = "clip"
+    names = ("low", "high")
+
+
+@dataclass(frozen=True, eq=False)
+class Slopes(PerUnit):
+    """``x * slope`` where ``x`` is negative, as the PReLU with a slope for each unit."""
+
+    slope: Floats
+    op = "slopes"
+    names = ("slope",)
+
+    @property
+    def name(self) -> str:
+        return "leaky_relu"
+
+
+@dataclass(frozen=True, eq=False)
+class Activation(Node):
+    """A function of one number, element by element.
+
+    :param kind: which, among the NumPy loader's
+    :param parameters: by name
+    """
+
+    kind: str
+    parameters: Mapping[str, float] = field(default_factory=dict)
+    op = "activation"
+
+    @property
+    def name(self) -> str:
+        return self.kind
+
+    def fields(self) -> dict[str, NDArray[Any]]:
+        return {name: np.array(value, np.float32) for name, value in self.parameters.items()}
+
+
+@dataclass(frozen=True, eq=False)
+class Weighted(Node):
+    """A layer with connections.
+
+    :param weight: of shape ``(outputs, inputs)`` or ``(outputs, inputs, height, width)``
+    :param bias: of shape ``(outputs,)``
+    """
+
+    weight: Floats
+    bias: Floats
+
+    @property
+    def rows(self) -> Floats:
+        """The weight, a row for each output."""
+        return self.weight.reshape(len(self.weight), -1)
+
+    @property
+    def nnz(self) -> int:
+        """Connections that are not 0."""
+        return int(np.count_nonzero(self.weight))
+
+    def fields(self) -> dict[str, NDArray[Any]]:
+        return {"weight": self.rows, "bias": self.bias[:, None]}
+
+
+@dataclass(frozen=True, eq=False)
+class Linear(Weighted):
+    """``weight @ x + bias``."""
+
+    op = "linear"
+
+
+@dataclass(frozen=True, eq=False)
+class Conv(Weighted):
+    """A convolution over height and width, zeros around.
+
+    :param stride: steps down and right
+    :param padding: zeros above and below, left and right
+    """
+
+    stride: tuple[int, int]
+    padding: tuple[int, int]
+    op = "conv"
+
+    def fields(self) -> dict[str, NDArray[Any]]:
+        return {
+            **super().fields(),
+            "kernel": np.array(self.weight.shape[2:]),
+            "stride": np.array(self.stride),
+            "padding": np.array(self.padding),
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class MaxPool(Node):
+    """The largest of each window."""
+
+    kernel: tuple[int, int]
+    stride: tuple[int, int]
+    padding: tuple[int, int]
+    op = "max_pool"
+
+    def fields(self) -> dict[str, NDArray[Any]]:
+        return {name: np.array(getattr(self, name)) for name in ("kernel", "stride", "padding")}
+
+
+@dataclass(frozen=True, eq=False)
+class Flatten(Node):
+    """All units in one row."""
+
+    op = "flatten"
+
+
+@dataclass(frozen=True, eq=False)
+class Add(Node):
+    """The sum of two values."""
+
+    op = "add"
+
+
+@dataclass(frozen=True, eq=False)
+class Concat(Node):
+    """Values behind each other."""
+
+    op = "concat"
+
+
+@dataclass(frozen=True, eq=False)
+class Slice(Node):
+    """A part of the observation.
+
+    :param start: its first number
+    """
+
+    start: int
+    op = "slice"
+
+    def fields(self) -> dict[str, NDArray[Any]]:
+        stop = self.start + int(np.prod(self.shape))
+        return {"range": np.array([self.start, stop]), "shape": np.array(self.shape)}
+
+
+@dataclass(frozen=True, eq=False)
+class OneHot(Node):
+    """For each whole number as many units as it has values, all 0 but that of its value, 1.
+
+    :param sizes: values of each number
+    """
+
+    sizes: tuple[int, ...]
+    op = "one_hot"
+
+    def fields(self) -> dict[str, NDArray[Any]]:
+        values = np.concatenate([np.arange(size) for size in self.sizes])
+        return {"sizes": np.array(self.sizes), "values": values.astype(np.float32)[:, None]}
+
+
+@dataclass(frozen=True, eq=False)
+class Argmax(Node):
+    """The index of the largest in each group of consecutive units, the first of equals.
+
+    :param sizes: units of each group
+    """
+
+    sizes: tuple[int, ...]
+    op = "argmax"
+
+    def fields(self) -> dict[str, NDArray[Any]]:
+        return {"splits": np.cumsum(self.sizes)[:-1]}
+
+
+@dataclass(frozen=True, eq=False)
+class Positive(Node):
+    """1 where positive, else 0."""
+
+    op = "positive"

@@ -1,0 +1,106 @@
+"""What an SB3 policy does to an observation before its features extractor sees it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_sparse.errors import UnsupportedError
+from sb3_sparse.export.activations import scaled
+from sb3_sparse.export.graph import Part
+from sb3_sparse.export.nodes import Normalize, OneHot, Slice
+from sb3_sparse.export.trace import Tracer
+
+
+@dataclass(frozen=True)
+class Observed:
+    """What an exported policy takes.
+
+    :param shape: of one observation; a dict is one row, its parts behind each other
+    :param pixels: whether it is an image of uint8
+    :param parts: of a dict
+    """
+
+    shape: tuple[int, ...]
+    pixels: bool
+    parts: tuple[Part, ...] = ()
+
+
+def observed(space: spaces.Space[Any]) -> Observed:
+    """What an exported policy of a space takes.
+
+    :raises UnsupportedError: for a space whose observations are not rows of numbers
+    """
+    if isinstance(space, spaces.Dict):
+        parts = tuple(
+            Part(key, _shape(part), is_image_space(part)) for key, part in space.spaces.items()
+        )
+        return Observed((sum(part.size for part in parts),), False, parts)
+    return Observed(_shape(space) or (1,), is_image_space(space))
+
+
+def preprocessed(
+    tracer: Tracer,
+    space: spaces.Space[Any],
+    normalization: VecNormalize | None,
+    normalize_images: bool,
+) -> int | Mapping[str, int]:
+    """The value that the features extractor gets; of a dict one for each key.
+
+    :param normalization: what normalises observations before the policy sees them
+    :param normalize_images: whether the policy divides pixels by 255
+    """
+    rms: Any = None if normalization is None else normalization.obs_rms
+    if not isinstance(space, spaces.Dict):
+        return _part(tracer, space, 0, rms, normalization, normalize_images)
+    values, start = {}, 0
+    for part in observed(space).parts:
+        value = tracer.add(Slice((0,), part.shape or (1,), start))
+        start += part.size
+        known = (rms or {}).get(part.key)
+        sub = space.spaces[part.key]
+        values[part.key] = _part(tracer, sub, value, known, normalization, normalize_images)
+    return values
+
+
+def _shape(space: spaces.Space[Any]) -> tuple[int, ...]:
+    allowed = isinstance(space, (spaces.Box, spaces.MultiBinary, spaces.Discrete)) or (
+        isinstance(space, spaces.MultiDiscrete) and space.nvec.ndim == 1
+    )
+    if not allowed:
+        raise UnsupportedError(
+            f"a policy of observations in {space} cannot be exported; allowed are Box, Discrete, "
+            "MultiDiscrete (of one axis), MultiBinary, and Dict of these"
+        )
+    assert space.shape is not None
+    return space.shape
+
+
+def _part(
+    tracer: Tracer,
+    space: spaces.Space[Any],
+    value: int,
+    rms: Any,
+    normalization: VecNormalize | None,
+    normalize_images: bool,
+) -> int:
+    shape = tracer.shape_of(value)
+    if rms is not None:
+        assert normalization is not None
+        scale = 1.0 / np.sqrt(rms.var + normalization.epsilon)
+        clip = float(normalization.clip_obs)
+        value = tracer.add(Normalize((value,), shape, rms.mean, scale, clip))
+    if isinstance(space, (spaces.Discrete, spaces.MultiDiscrete)):
+        numbers = [space.n] if isinstance(space, spaces.Discrete) else space.nvec
+        sizes = tuple(int(number) for number in numbers)
+        return tracer.add(OneHot((value,), (sum(sizes),), sizes))
+    if normalize_images and is_image_space(space):
+        for make in scaled(1.0 / 255.0):
+            value = tracer.add(make(value, shape))
+    return value
