@@ -14,7 +14,6 @@ from sb3_sparse.report.tables import cells_table, runs_table, verdicts_table, wr
 from sb3_sparse.report.verdicts import verdicts
 
 FOLDER = "figures"
-KINDS = ("png", "svg", "csv")
 
 
 def write_report(
@@ -30,8 +29,9 @@ def write_report(
     """Write a report on run folders.
 
     It makes ``index.html``, which opens from disk without a network, ``cells.csv``, ``runs.csv``,
-    ``verdicts.csv``, and ``figures/<name>`` as PNG, SVG and CSV. Figures that these runs do not
-    give are left out with a reason on the page. The same runs give the same bytes.
+    ``verdicts.csv``, and ``figures/<name>`` as PNG, SVG and CSV. A figure that these
+    runs do not give stays as an earlier report in ``out`` has drawn it, or is left out; the page
+    says why. The same runs give the same bytes.
 
     :param folders: of runs; what cannot be used is named on the page
     :param out: folder to write to
@@ -66,8 +66,15 @@ def _figure(name: str, study: Study, folder: Path) -> Shown:
     try:
         drawing = draw(name, study)
     except NotEnoughData as error:
-        for kind in KINDS:  # an older report's, which these runs do not give
-            (folder / f"{name}.{kind}").unlink(missing_ok=True)
-        return Shown(name, None, [str(error)])
+        return _kept(name, folder, str(error))
     save(name, drawing, folder)
     return Shown(name, (folder / f"{name}.svg").read_bytes(), list(drawing.remarks))
+
+
+def _kept(name: str, folder: Path, why_not: str) -> Shown:
+    """A figure that an earlier report has drawn, e.g. where the models still were; it stays."""
+    drawn = folder / f"{name}.svg"
+    if not drawn.is_file():
+        return Shown(name, None, [why_not])
+    remark = f"This is the figure of an earlier report. It cannot be drawn now: {why_not}"
+    return Shown(name, drawn.read_bytes(), [remark])

@@ -102,16 +102,27 @@ def test_the_same_runs_give_the_same_bytes(study_folders, tmp_path):
         assert path.read_bytes() == other.read_bytes(), path.name
 
 
-def test_a_figure_without_data_is_left_out_with_a_reason_and_its_old_files_go(folders, tmp_path):
-    folders.add(noise={0.0: 1.0, 1.0: 1.0})
-    out = tmp_path / "out"
-    write_report(folders.made, out, title="t", figures=["noise", "iqm", "snr"])
-    assert (out / "figures" / "noise.svg").is_file()
-    (folders.made[0] / "robustness.csv").unlink()
-    page = write_report(folders.made, out, title="t", figures=["noise", "iqm", "snr"]).read_text()
-    assert not (out / "figures" / "noise.svg").exists()
+def test_a_figure_without_data_is_left_out_with_a_reason(folders, tmp_path):
+    folders.add()
+    page = write_report(folders.made, tmp_path, title="t", figures=["noise", "iqm"]).read_text()
     assert "Left out: no run has a robustness.csv" in page
     assert "fewer than 2 runs" in page
+
+
+@pytest.mark.parametrize(("name", "lost"), [("noise", "robustness.csv"), ("masks", "*.zip")])
+def test_what_cannot_be_drawn_again_stays_and_the_page_says_so(name, lost, folders, tmp_path):
+    """As in a clone of a repository that has the reports, and not the models."""
+    folders.add(noise={0.0: 1.0, 1.0: 1.0}, model=True)
+    out = tmp_path / "out"
+    write_report(folders.made, out, title="t", figures=[name])
+    before = {path: path.read_bytes() for path in (out / "figures").iterdir()}
+    assert {path.name for path in before} == {f"{name}.{kind}" for kind in ("png", "svg", "csv")}
+    (gone,) = folders.made[0].glob(lost)
+    gone.unlink()
+    page = write_report(folders.made, out, title="t", figures=[name]).read_text()
+    assert {path: path.read_bytes() for path in (out / "figures").iterdir()} == before
+    assert "the figure of an earlier report. It cannot be drawn now: no " in page
+    assert f"figures/{name}.svg" in page
 
 
 def test_a_report_on_nothing_is_a_page_all_the_same(tmp_path):
