@@ -29,6 +29,10 @@ class RunBusy(ConfigError):
     """Another process is at work in a run's folder."""
 
 
+class TuningFailed(SparsityError, RuntimeError):
+    """No trial of a study came to its end."""
+
+
 class UnsupportedError(SparsityError, TypeError):
     """An algorithm, layer or space that sparse training does not cover."""
 

@@ -53,10 +53,10 @@ def test_tune_searches_writes_the_best_goes_on_and_reports(tmp_path):
 
 
 def test_trials_that_fail_are_shown_and_the_exit_code_says_so(tmp_path):
-    (tmp_path / "mine.yml").write_text("weight_decay: [0.0, -1.0]\n")
+    (tmp_path / "mine.yml").write_text("env_wrapper: [null, no.such.Wrapper]\n")
     done = sb3_sparse("tune", *QUICK, "--space", "mine.yml", *SMALL, cwd=tmp_path)
     assert done.returncode == 1
-    assert re.search(r"trial \d failed: ConfigError: .*weight_decay.*-1.0", done.stdout)
+    assert re.search(r"trial \d failed: ConfigError: .*No module named 'no'", done.stdout)
     assert "1 of 2 trials are done, 1 failed; the logs of the workers are in" in done.stdout
     assert "Best: " in done.stdout
 

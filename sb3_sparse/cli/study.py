@@ -63,6 +63,7 @@ def run(
     study = Study.read(name, scale, packages)
     if Path(name).suffix:
         _check_figures(study)
+    _say_merged(study)
     runner = run_study(study, store, launcher_named(launcher, address), workers)
     shown = StudyProgress(console)
     last = None
@@ -109,6 +110,7 @@ def status(
     packages = gym_packages or []
     study = Study.read(name, scale, packages)
     standings = _standings(study, store)
+    _say_merged(study)
     found = counts(standings)
     console.print(f"{study.title}, scale {scale}: {len(standings)} runs")
     console.print(", ".join(f"{number} {what}" for what, number in found.items()))
@@ -154,6 +156,13 @@ def report(
         pending=[_pending(one, store) for one in standings if one.status != "done"],
     )
     console.print(f"Written: {page}", soft_wrap=True)
+
+
+def _say_merged(study: Study) -> None:
+    if study.merged:
+        names = "; ".join(study.merged)
+        line = f"note: in the file more than once, and trained once: {names}"
+        console.print(line, markup=False, soft_wrap=True)
 
 
 def _check_figures(study: Study) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, fields
@@ -43,6 +44,7 @@ class Study:
     :param figures: names of figures, as :mod:`sb3_sparse.report` has them
     :param varies: the setting that the study varies; None: none but method and sparsity
     :param cells: what is trained, first seeds first
+    :param merged: names of cells that the file has more than once; they are trained once
     """
 
     name: str
@@ -51,6 +53,7 @@ class Study:
     figures: tuple[str, ...]
     varies: str | None
     cells: tuple[Cell, ...]
+    merged: tuple[str, ...] = ()
 
     @classmethod
     def read(cls, what: str, scale: str, gym_packages: Sequence[str] = ()) -> Study:
@@ -84,9 +87,13 @@ class Study:
             near = did_you_mean(scale, map(str, scales)) if isinstance(scales, Mapping) else ""
             raise ConfigError(f"{path} has no scale {scale!r}{near}, only {known}")
         try:
-            cells = tuple(_cells(content, scales[scale] or {}, gym_packages))
+            given = list(_cells(content, scales[scale] or {}, gym_packages))
+            times = Counter(cell.address for cell in given)
         except ConfigError as error:
             raise ConfigError(f"{path}, scale {scale}: {error}") from error
+        first = {cell.address: cell for cell in reversed(given)}
+        cells = tuple(first[address] for address in times)
+        merged = tuple(cell.name for cell in cells if times[cell.address] > 1)
         if not cells:
             raise ConfigError(
                 f"{path} has no run at scale {scale}: its blocks and the scale have no method or "
@@ -94,7 +101,7 @@ class Study:
             )
         title, varies = str(content["title"]), content.get("varies")
         _check_varies(varies, cells, path)
-        return cls(path.stem, scale, title, tuple(figures), varies, cells)
+        return cls(path.stem, scale, title, tuple(figures), varies, cells, merged)
 
     @property
     def report_folder(self) -> Path:
@@ -121,7 +128,7 @@ def check_keys(given: Any, allowed: set[str], where: str) -> None:
 def _cells(
     content: Mapping[str, Any], of_scale: Any, gym_packages: Sequence[str]
 ) -> Iterator[Cell]:
-    """All cells of a scale, first seeds first, none twice."""
+    """All cells of a scale as the file has them, first seeds first."""
     check_keys(of_scale, RUN_KEYS | {SEEDS, MEASURES, SCHEDULE, VARY}, "a scale")
     if not isinstance(content["runs"], list):
         raise ConfigError(f"runs must be a list of blocks, got {content['runs']!r}")
@@ -147,14 +154,11 @@ def _cells(
         for whole in [{**given, PACKAGES: (*known, *gym_packages)}]
         for arguments in [_with_schedule(whole, schedule)]
     ]
-    seen: set[str] = set()
     for seed in range(seeds):
         for arguments in runs:
             cell = Cell(Run(**arguments, seed=seed), measures, trained)
             measures.check(cell.run.algorithm)
-            if cell.address not in seen:
-                seen.add(cell.address)
-                yield cell
+            yield cell
 
 
 def _check_varies(varies: Any, cells: Sequence[Cell], path: Path) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 from sb3_sparse.errors import MissingExtra
 
@@ -14,9 +16,32 @@ try:
 except ImportError as error:
     raise MissingExtra("tuning", "tune") from error
 
-# Lists are good choices too, e.g. of net_arch: they are written to storages as they are.
-warnings.filterwarnings("ignore", message="Choices for a categorical distribution should be")
-warnings.filterwarnings("ignore", message=".* contains a value with the type of .*GridSampler")
-optuna.logging.set_verbosity(optuna.logging.WARNING)
+__all__ = [
+    "BaseDistribution",
+    "BaseStorage",
+    "FrozenTrial",
+    "Trial",
+    "TrialState",
+    "optuna",
+    "quiet_optuna",
+]
 
-__all__ = ["BaseDistribution", "BaseStorage", "FrozenTrial", "Trial", "TrialState", "optuna"]
+
+@contextmanager
+def quiet_optuna() -> Iterator[None]:
+    """Within it, Optuna says what goes wrong, and no more. Afterwards all is as it was.
+
+    Lists are good choices too, e.g. of net_arch: they are written to storages as they are.
+    """
+    level = optuna.logging.get_verbosity()
+    optuna.logging.set_verbosity(max(level, optuna.logging.WARNING))
+    try:
+        with warnings.catch_warnings():
+            for message in (
+                "Choices for a categorical distribution should be",
+                ".* contains a value with the type of .*GridSampler",
+            ):
+                warnings.filterwarnings("ignore", message=message)
+            yield
+    finally:
+        optuna.logging.set_verbosity(level)

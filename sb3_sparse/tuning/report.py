@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from sb3_sparse.errors import ConfigError, MissingExtra, SparsityError
-from sb3_sparse.tuning.backend import BaseStorage, FrozenTrial, TrialState, optuna
+from sb3_sparse.tuning.backend import BaseStorage, FrozenTrial, TrialState, optuna, quiet_optuna
 from sb3_sparse.tuning.definition import Definition
 from sb3_sparse.tuning.objective import VALUES
 from sb3_sparse.tuning.spaces import with_values
 from sb3_sparse.tuning.storage import FOLDER, JOURNAL, open_existing
-from sb3_sparse.tuning.study import DEFINITION, definition_of, find_study, standing_of
+from sb3_sparse.tuning.study import DEFINITION, definition_of, find_study, folder_name, standing_of
 from sb3_sparse.tuning.urls import shown_url
 from sb3_sparse.zoo.settings import policy_kwargs_of
 
@@ -46,6 +46,7 @@ FIGURES: dict[str, Callable[[optuna.Study], Any]] = {
 }
 
 
+@quiet_optuna()
 def write_report(studies: Sequence[optuna.Study], storage: BaseStorage, path: Path) -> Path:
     """Write a page that opens without a network, and beside it a CSV of all trials.
 
@@ -77,6 +78,7 @@ def write_report(studies: Sequence[optuna.Study], storage: BaseStorage, path: Pa
     return path
 
 
+@quiet_optuna()
 def report_on(
     names: Sequence[str], storage: str | Path | None, log_folder: Path, path: Path | None
 ) -> Path:
@@ -90,7 +92,7 @@ def report_on(
     storage = storage or log_folder / FOLDER / JOURNAL
     opened = open_existing(storage)
     studies = [find_study(opened, name, shown_url(storage)) for name in names]
-    folder = log_folder / FOLDER / names[0].replace("/", "-")
+    folder = log_folder / FOLDER / folder_name(names[0])
     return write_report(studies, opened, path or folder / "report.html")
 
 

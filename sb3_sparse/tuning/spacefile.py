@@ -8,7 +8,7 @@ from typing import Any
 
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.loading.text import read_text
-from sb3_sparse.tuning.backend import BaseDistribution
+from sb3_sparse.tuning.backend import BaseDistribution, quiet_optuna
 from sb3_sparse.tuning.shipped import paper_space, wide_space
 from sb3_sparse.tuning.spaces import (
     CategoricalDistribution,
@@ -26,6 +26,7 @@ from sb3_sparse.zoo.settings import method_of
 SHIPPED = ("paper", "wide")
 
 
+@quiet_optuna()
 def space_of(what: str, run: Run) -> Space:
     """A shipped space for a run, or the user's own from a file.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Set
 from contextlib import suppress
 from dataclasses import dataclass, field, fields, replace
@@ -11,7 +12,7 @@ from sb3_sparse.callback import SparsityCallback
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.policies.config import SparsityConfig
 from sb3_sparse.topology import method_named
-from sb3_sparse.tuning.backend import BaseDistribution, Trial, optuna
+from sb3_sparse.tuning.backend import BaseDistribution, Trial, optuna, quiet_optuna
 from sb3_sparse.zoo.run import DENSE, Run
 from sb3_sparse.zoo.settings import find_callback, method_of, policy_kwargs_of
 
@@ -33,7 +34,8 @@ class Space:
     :param distributions: Optuna's distribution of each; empty where ``code`` says how to sample
     :param code: Python source that defines ``space``, a function of an Optuna trial that returns
         the values by name
-    :raises ConfigError: for an empty space
+    :raises ConfigError: for an empty space, bounds that are not finite, or choices that are not
+        numbers or that stand there twice
     """
 
     name: str
@@ -46,6 +48,8 @@ class Space:
                 f"the search space {self.name!r} is empty: it must name at least one "
                 "hyperparameter, e.g. weight_decay: [0.0, 1.0e-4]"
             )
+        for name, distribution in self.distributions.items():
+            _check_distribution(name, distribution, self.name)
 
     def sample(self, trial: Trial) -> dict[str, Any]:
         """Values for a trial, by name.
@@ -72,6 +76,9 @@ class Space:
                 "{'weight_decay': trial.suggest_float('weight_decay', 1e-7, 1e-2)}, got "
                 f"{values!r}"
             )
+        for name, value in values.items():
+            if isinstance(value, float) and math.isnan(value):
+                raise ConfigError(f"space(trial) in {self.name} gives {name} the value nan")
         return dict(values)
 
     @property
@@ -101,6 +108,29 @@ class Space:
             {name: of(text) for name, text in values["distributions"].items()},
             values["code"],
         )
+
+
+def _check_distribution(name: str, distribution: BaseDistribution, space: str) -> None:
+    where = f"{name} in the search space {space!r}"
+    if isinstance(distribution, CategoricalDistribution):
+        known: list[Any] = []
+        for choice in distribution.choices:
+            if isinstance(choice, float) and math.isnan(choice):
+                raise ConfigError(f"{where} has the choice nan, which is no number; leave it out")
+            if any(type(one) is type(choice) and one == choice for one in known):
+                raise ConfigError(
+                    f"{where} has the choice {choice!r} twice, so the same would be trained twice; "
+                    "leave one out, and give --seeds for more runs a trial"
+                )
+            known.append(choice)
+        return
+    assert isinstance(distribution, (FloatDistribution, IntDistribution))
+    for end in (distribution.low, distribution.high, distribution.step):
+        if end is not None and not math.isfinite(end):
+            raise ConfigError(
+                f"{where} must lie between finite numbers, e.g. {{low: 1.0e-5, high: 0.01}}, got "
+                f"{distribution.low} to {distribution.high}"
+            )
 
 
 def _suggest(trial: Trial, name: str, distribution: BaseDistribution) -> Any:
@@ -138,6 +168,7 @@ def with_values(run: Run, values: Mapping[str, Any]) -> Run:
     return replace(run, hyperparams={**run.hyperparams, **values})
 
 
+@quiet_optuna()
 def samples_of(space: Space) -> list[dict[str, Any]]:
     """Samples of a space, always the same; of a function so many that its branches are seen."""
     study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))

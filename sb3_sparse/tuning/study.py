@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -10,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from sb3_sparse.errors import ConfigError
-from sb3_sparse.tuning.backend import BaseStorage, FrozenTrial, TrialState, optuna
+from sb3_sparse.tuning.backend import BaseStorage, FrozenTrial, TrialState, optuna, quiet_optuna
 from sb3_sparse.tuning.definition import Definition, differences
 from sb3_sparse.tuning.samplers import TICKET
 
@@ -46,6 +47,11 @@ def enter_study(
             study.set_user_attr(DEFINITION, wanted)
         _fill(study, definition_of(study), max(trials, known.get(FILLED, 0)), alive)
     return study
+
+
+def folder_name(name: str) -> str:
+    """The name of a study's folder; no two studies have the same."""
+    return re.sub(r"[%/\\]", lambda found: f"%{ord(found.group()):02X}", name)
 
 
 @contextmanager
@@ -133,6 +139,7 @@ def find_study(storage: BaseStorage, name: str, where: str) -> optuna.Study:
     return study
 
 
+@quiet_optuna()
 def definition_of(study: optuna.Study) -> Definition:
     """What the study is."""
     return Definition.from_dict(study.user_attrs[DEFINITION])

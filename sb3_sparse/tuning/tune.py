@@ -10,15 +10,15 @@ from pathlib import Path
 from platform import node
 from typing import Any
 
-from sb3_sparse.errors import ConfigError
+from sb3_sparse.errors import ConfigError, TuningFailed
 from sb3_sparse.launch import Launcher, Task, check_workers, launcher_named
-from sb3_sparse.tuning.backend import FrozenTrial, optuna
+from sb3_sparse.tuning.backend import FrozenTrial, optuna, quiet_optuna
 from sb3_sparse.tuning.best import BEST, write_best
 from sb3_sparse.tuning.definition import Definition, fixed_compute
 from sb3_sparse.tuning.spacefile import space_of
 from sb3_sparse.tuning.spaces import Space
 from sb3_sparse.tuning.storage import FOLDER, HEARTBEAT, JOURNAL, open_storage
-from sb3_sparse.tuning.study import Standing, enter_study, standing_of
+from sb3_sparse.tuning.study import ERROR, Standing, enter_study, folder_name, standing_of
 from sb3_sparse.tuning.urls import is_journal, shown_url
 from sb3_sparse.zoo.prepare import prepare
 from sb3_sparse.zoo.run import Run
@@ -53,6 +53,7 @@ class Tuned:
         return self.standing.best
 
 
+@quiet_optuna()
 def tune(
     run: Run,
     space: str | Space = "paper",
@@ -93,6 +94,7 @@ def tune(
     :param watch: called with the study's standing, about once in a second
     :raises ConfigError: for a value that is not allowed, a storage that cannot be reached, or
         another study of the same name; before anything is trained
+    :raises TuningFailed: if every trial failed; with the first one's reason
     """
     check_workers(workers)
     chosen = launcher_named(launcher) if isinstance(launcher, str) else launcher
@@ -100,7 +102,7 @@ def tune(
     name = definition.default_name if name is None else _checked(name)
     number = definition.trials(trials)
     storage = storage or log_folder.absolute() / FOLDER / JOURNAL
-    folder = log_folder.absolute() / FOLDER / name.replace("/", "-")
+    folder = log_folder.absolute() / FOLDER / folder_name(name)
     opened = open_storage(storage, heartbeat)
     errors: dict[str, str] = {}
     with _in_reach(storage):
@@ -118,7 +120,24 @@ def tune(
     with _in_reach(storage):
         standing = standing_of(study)
         config = write_best(study, folder / BEST) if standing.best is not None else None
+    _check_outcome(name, standing, folder, errors)
     return Tuned(study, standing, folder, config, began, errors)
+
+
+def _check_outcome(name: str, standing: Standing, folder: Path, errors: Mapping[str, str]) -> None:
+    """Raise if nothing came out, and nobody is at work any more."""
+    if standing.done or standing.running or not (standing.failed or errors):
+        return
+    texts = [
+        f"trial {trial.number}: {trial.user_attrs.get(ERROR, 'no reason known')}"
+        for trial in sorted(standing.failed, key=lambda trial: trial.number)
+    ] or [f"{worker}: {error.strip().splitlines()[-1]}" for worker, error in errors.items()]
+    count = len(standing.failed)
+    what = f"all {count} trials that were begun" if count else "all workers"
+    raise TuningFailed(
+        f"{what} of the study {name!r} failed, first {texts[0]}. The logs of the workers are in "
+        f"{folder}; the same command tries again"
+    )
 
 
 @contextmanager

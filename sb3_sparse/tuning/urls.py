@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +12,25 @@ DATABASES = ("sqlite", "postgresql", "mysql", "mariadb", "mssql")
 
 
 def is_journal(storage: str | Path) -> bool:
-    """Whether a storage is a path, so a journal file."""
-    return isinstance(storage, Path) or "://" not in storage
+    """Whether a storage is a path, so a journal file.
+
+    :raises ConfigError: if it is neither a path nor a URL, but something in between, e.g. a URL
+        with one slash, whose password would become the name of a folder
+    """
+    text = str(storage)
+    if not isinstance(storage, Path) and "://" in text:
+        return False
+    on_windows = re.match(r"[A-Za-z]:[\\/]", text)
+    rest = text[2:] if on_windows else text
+    scheme = re.match(r"\s*([A-Za-z][A-Za-z0-9+.-]*):", rest)
+    if (scheme or re.search(r":.*@", rest)) and not Path(text).exists():
+        name = scheme.group(1) if scheme and scheme.group(1).split("+")[0] in DATABASES else ""
+        raise ConfigError(
+            f"the storage {f'{name}:...' if name else 'of this form'} looks like a URL, and is "
+            "none; give a path (a journal file) or a URL as text, with its two or three slashes: "
+            "sqlite:///file.db, postgresql://user:password@host:5432/database, mysql://..."
+        )
+    return True
 
 
 def file_of(storage: str | Path) -> Path | None:

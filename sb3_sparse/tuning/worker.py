@@ -8,7 +8,7 @@ import traceback
 from pathlib import Path
 from platform import node
 
-from sb3_sparse.tuning.backend import FrozenTrial, Trial, TrialState, optuna
+from sb3_sparse.tuning.backend import FrozenTrial, Trial, TrialState, optuna, quiet_optuna
 from sb3_sparse.tuning.objective import Objective
 from sb3_sparse.tuning.queue import QueueEmpty
 from sb3_sparse.tuning.storage import HEARTBEAT, open_storage, retry_with
@@ -23,6 +23,7 @@ class TooManyFailures(Exception):
     """Trials fail one after the other."""
 
 
+@quiet_optuna()
 def work(
     storage: str | Path, name: str, folder: str | Path, heartbeat: int = HEARTBEAT
 ) -> dict[str, int]:

@@ -212,3 +212,19 @@ def test_dense_widths_of_the_actor_critic_study_keep_their_budget():
         total = 17 * pi + pi * pi + 12 * pi + 2 * (23 * qf + qf * qf + qf)
         dense = 17 * 256 + 256 * 256 + 12 * 256 + 2 * (23 * 256 + 256 * 256 + 256)
         assert min(abs(total / dense - budget) for budget in (1.0, 0.2, 0.1)) < 0.01
+
+
+def test_cells_that_stand_there_twice_are_trained_once_and_named(tmp_path, capsys):
+    runs = [{"method": "dense"}, {"method": "dense", "hyperparams": {"gamma": 0.99}}]
+    study = read(tmp_path, runs=runs)
+    assert len(study.cells) == 2 * 2
+    assert study.merged == tuple(cell.name for cell in study.cells)
+    assert read(tmp_path).merged == ()
+    from sb3_sparse.cli.study import status
+
+    path = str(tmp_path / "mine.yml")
+    read(tmp_path, runs=runs)
+    status(path, "smoke", tmp_path / "store")
+    said = capsys.readouterr().out
+    assert f"in the file more than once, and trained once: {study.merged[0]}; " in said
+    assert not (tmp_path / "store").exists()

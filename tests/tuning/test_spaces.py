@@ -255,3 +255,34 @@ def test_trials_store_layers_in_one_way_so_that_they_are_repeatable(changes, com
 def test_a_machine_without_kernels_masks(monkeypatch):
     monkeypatch.setattr("sb3_sparse.tuning.definition.why_missing", lambda: "no compiler")
     assert fixed_compute(Run(sparsity=0.95)) == "masked"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("learning_rate: {low: .nan, high: 0.1}", "learning_rate in .*(finite|nan)"),
+        ("learning_rate: {low: 0.001, high: .inf}", "must lie between finite numbers"),
+        ("learning_rate: {low: -.inf, high: 0.1}", "must lie between finite numbers"),
+        ("learning_rate: {low: 0.001, high: 0.1, step: .nan}", "learning_rate in "),
+        ("weight_decay: [0.0, .nan]", "weight_decay in .* has the choice nan"),
+        ("weight_decay: [0.0, 1.0e-4, 0.0]", "has the choice 0.0 twice.*--seeds"),
+        ("net_arch: [[8], [16], [8]]", r"has the choice \[8\] twice"),
+    ],
+)
+def test_bounds_and_choices_that_are_no_numbers_or_stand_twice_are_refused(text, message, tmp_path):
+    (tmp_path / "mine.yml").write_text(text + "\n")
+    with pytest.raises(ConfigError, match=message):
+        space_of(str(tmp_path / "mine.yml"), small_run(hyperparams={}))
+
+
+def test_the_same_holds_for_spaces_made_in_python():
+    ranges = optuna.distributions.FloatDistribution
+    with pytest.raises(ConfigError, match="must lie between finite numbers"):
+        Space("mine", {"learning_rate": ranges(0.1, float("inf"))})
+    space = Space("mine", code="def space(trial):\n    return {'learning_rate': float('nan')}")
+    with pytest.raises(ConfigError, match="gives learning_rate the value nan"):
+        check_space(space, small_run())
+
+
+def test_true_and_one_are_two_choices():
+    assert choices(batch_size=[1, True]).grid == {"batch_size": [1, True]}

@@ -15,8 +15,8 @@ from itertools import product
 import pytest
 from tuning_support import choices, small_run
 
-from sb3_sparse.errors import ConfigError
-from sb3_sparse.launch import Launcher
+from sb3_sparse.errors import ConfigError, TuningFailed
+from sb3_sparse.launch import Ended, Launcher
 from sb3_sparse.tuning import Space, tune
 from sb3_sparse.tuning.backend import TrialState, optuna
 from sb3_sparse.tuning.queue import QueueEmpty
@@ -180,6 +180,49 @@ def test_trials_that_fail_are_noted_and_tried_again_by_the_next_command(tmp_path
     assert all("No module named 'no'" in trial.user_attrs["error"] for trial in standing.failed)
     made(tmp_path, space)
     assert states(study) == {"COMPLETE": 1, "FAIL": 2, "WAITING": 2}
+
+
+class Here(Launcher):
+    """Runs the tasks in this process."""
+
+    def run(self, tasks, workers):
+        for task in tasks:
+            try:
+                yield Ended(task, value=task())
+            except Exception as error:
+                yield Ended(task, error=f"Traceback:\n{error}")
+
+
+@pytest.mark.parametrize("trials", [2, 5])  # a worker gives up after three
+def test_a_study_in_which_every_trial_fails_is_an_error_with_the_first_reason(trials, tmp_path):
+    space = choices(env_wrapper=[f"no.such.Wrapper{n}" for n in range(trials)])
+    begun = min(trials, 3)
+    with pytest.raises(TuningFailed, match=rf"all {begun} trials that were begun .*'no'") as said:
+        tune(small_run(), space, log_folder=tmp_path, launcher=Here(), name="study")
+    assert "first trial 0: " in str(said.value)
+    assert f"The logs of the workers are in {tmp_path}/tune/study;" in str(said.value)
+    tune(small_run(), choices(env_wrapper=[None, "no.such"]), log_folder=tmp_path, launcher=Here())
+
+
+def test_workers_that_come_to_no_trial_are_an_error_too(tmp_path):
+    class Dead(Launcher):
+        def run(self, tasks, workers):
+            yield Ended(tasks[0], error="its process was killed\nby SIGKILL")
+
+    with pytest.raises(TuningFailed, match="all workers .* failed, first worker 1: by SIGKILL"):
+        tune(small_run(), choices(**GRID), log_folder=tmp_path, launcher=Dead())
+
+
+@pytest.mark.parametrize("names", [("x/y", "x-y", "x%2Fy", "x%y", "x%25y"), ("a\\b", "a%5Cb")])
+def test_studies_of_different_names_never_share_a_folder(names, tmp_path):
+    folders = {
+        tune(
+            small_run(), choices(**GRID), log_folder=tmp_path, name=name, launcher=NoWorkers()
+        ).folder
+        for name in names
+    }
+    assert len(folders) == len(names)
+    assert {folder.parent for folder in folders} == {tmp_path / "tune"}
 
 
 def test_a_worker_that_does_not_see_the_study_says_so(tmp_path):
