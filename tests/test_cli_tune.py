@@ -94,3 +94,16 @@ def test_mistakes_are_one_line_and_make_nothing(args, message, tmp_path, mistake
     assert message in line
     assert "s3cret" not in line
     assert not (tmp_path / "logs").exists()
+
+
+def test_help_has_a_line_on_every_command(capsys, monkeypatch):
+    monkeypatch.setattr("sys.argv", ["sb3-sparse", "--help"])
+    monkeypatch.setenv("COLUMNS", "200")
+    from sb3_sparse.cli import main
+
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 0
+    said = re.sub(r"\x1b\[[0-9;]*m", "", capsys.readouterr().out)
+    for name in ("train", "enjoy", "inspect", "compress", "export", "tune", "study"):
+        assert re.search(rf"^[^\w\n]*{name} +[A-Z]\w+", said, re.MULTILINE), name

@@ -187,6 +187,8 @@ def _print_outcome(run: Run, tuned: Tuned, storage: str | None, log_folder: Path
     where = [] if storage is None else ["--storage", shown_url(storage)]
     where += [] if log_folder == Path("logs") else ["--log-folder", str(log_folder)]
     train = ["train", "--algo", run.algo, "--env", run.env_id, "--conf-file", str(tuned.config)]
+    for package in run.gym_packages:
+        train += ["--gym-packages", package]
     for command in (train, ["tune", "report", name, *where]):
         _say(shlex.join(["sb3-sparse", *command]))
 

@@ -133,7 +133,7 @@ def _check_outcome(name: str, standing: Standing, folder: Path, errors: Mapping[
         for trial in sorted(standing.failed, key=lambda trial: trial.number)
     ] or [f"{worker}: {error.strip().splitlines()[-1]}" for worker, error in errors.items()]
     count = len(standing.failed)
-    what = f"all {count} trials that were begun" if count else "all workers"
+    what = f"every trial that was begun ({count})" if count else "every worker"
     raise TuningFailed(
         f"{what} of the study {name!r} failed, first {texts[0]}. The logs of the workers are in "
         f"{folder}; the same command tries again"

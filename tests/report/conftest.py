@@ -127,6 +127,7 @@ class Folders:
         content = io.BytesIO()
         th.save(state, content)
         with zipfile.ZipFile(path, "w") as file:
+            file.writestr("data", "{}")
             file.writestr("policy.pth", content.getvalue())
 
 

@@ -125,7 +125,7 @@ def test_a_function_may_search_what_depends_on_other_values(tmp_path):
 @pytest.mark.parametrize(
     ("run", "space", "message"),
     [
-        ({}, dict(weight_decai=[0.0]), "has no hyperparameter 'weight_decai'; did you mean"),
+        ({}, dict(weight_decai=[0.0]), "has no hyperparameter 'weight_decai' .did you mean"),
         ({}, dict(n_timesteps=[10, 20]), "trials are compared at equal numbers of steps"),
         (
             dict(hyperparams={"n_envs": 2}),
