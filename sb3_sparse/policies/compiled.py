@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TypeVar
 
+from torch import nn
+
 Policy = TypeVar("Policy")
 Value = TypeVar("Value")
 
@@ -25,4 +27,19 @@ def unwrapped(policy: Policy) -> Policy:
 
 def plain_names(state: Mapping[str, Value]) -> dict[str, Value]:
     """A state_dict under the names that it has without ``torch.compile``."""
-    return {name.replace(f"{WRAPPED}.", ""): value for name, value in state.items()}
+    return {_plain(name): value for name, value in state.items()}
+
+
+def names_in(module: nn.Module, state: Mapping[str, Value]) -> dict[str, Value]:
+    """A state_dict under a module's own names, whichever parts of it are compiled.
+
+    :param state: under plain names
+    """
+    if not any(name.endswith(WRAPPED) for name, _ in module.named_modules()):
+        return dict(state)
+    names = {_plain(name): name for name in module.state_dict()}
+    return {names.get(name, name): value for name, value in state.items()}
+
+
+def _plain(name: str) -> str:
+    return name.replace(f"{WRAPPED}.", "")

@@ -20,7 +20,7 @@ from sb3_sparse.engine.linear import check_conversion
 from sb3_sparse.engine.optimizers import check_weight_decay, rebuild
 from sb3_sparse.errors import CorruptStateError
 from sb3_sparse.policies.build import build_networks
-from sb3_sparse.policies.compiled import plain_names
+from sb3_sparse.policies.compiled import names_in, plain_names
 from sb3_sparse.policies.config import SparsityConfig
 from sb3_sparse.policies.extractors import choose_extractor
 from sb3_sparse.policies.named import import_named
@@ -165,7 +165,8 @@ class SparsePolicyMixin(BasePolicy):
         """As in torch; weights without masks (of a dense policy) are masked, targets too."""
         state_dict = plain_names(state_dict)
         self._check_masks(state_dict)
-        incompatible = super().load_state_dict(state_dict, strict=strict, assign=assign)
+        named = names_in(self, state_dict)
+        incompatible = super().load_state_dict(named, strict=strict, assign=assign)
         if not any(key.endswith(".weight_mask") for key in state_dict):
             for layer in self.sparse.layers:
                 layer.mask_targets()

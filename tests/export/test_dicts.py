@@ -175,6 +175,23 @@ def test_a_combination_of_ones_own(to, tmp_path):
     assert export(model, tmp_path / "policy", to).parity.holds
 
 
+class Backwards(OwnCombination):
+    def forward(self, observations):
+        return th.cat([observations["b"], observations["a"]], dim=1)
+
+    def __init__(self, observation_space):
+        super().__init__(observation_space)
+        self._features_dim = 4
+
+
+def test_parts_in_another_order_are_not_taken_for_the_observation(tmp_path):
+    space = spaces.Dict({key: spaces.Box(-1, 1, (2,), np.float32) for key in "ab"})
+    kwargs = dict(features_extractor_class=Backwards)
+    model = make("PPO", Task(space, TORQUE), "MultiInputPolicy", policy_kwargs=kwargs)
+    for to in ("c", "numpy", "onnx"):
+        assert export(model, tmp_path / "policy", to).parity.holds
+
+
 def test_parts_that_are_passed_on_as_they_are_cost_nothing(tmp_path):
     space = spaces.Dict({"a": PARTS["vector"], "b": PARTS["switches"], "c": PARTS["matrix"]})
     model = make("SAC", Task(space, TORQUE))

@@ -17,6 +17,8 @@ from sb3_sparse.analysis import (
 )
 from sb3_sparse.analysis.networks import connections, parameters_by_network, specs_of
 from sb3_sparse.compress import compress
+from sb3_sparse.compress.state import fingerprint
+from sb3_sparse.errors import CorruptStateError
 from sb3_sparse.export import FORMATS, export
 from sb3_sparse.policies.compiled import plain_names, unwrapped
 from sb3_sparse.zoo.inspect import inspect_model
@@ -71,6 +73,32 @@ def test_a_part_that_is_compiled_is_exported_too(compute, tmp_path):
     actor.latent_pi = th.compile(actor.latent_pi, backend="eager")
     for to in FORMATS:
         assert export(model, tmp_path / "policy", to).parity.holds
+
+
+@pytest.mark.parametrize("compute", ["masked", "sparse"])
+def test_a_model_with_a_compiled_part_is_saved_and_loaded(compute, tmp_path):
+    plain, model = (make("SAC", policy_kwargs=dict(compute=compute)) for _ in range(2))
+    actor = model.policy.actor
+    actor.latent_pi = th.compile(actor.latent_pi, backend="eager")
+    actor.mu.weight.data.mul_(2)
+    model.save(tmp_path / "model.zip")
+    loaded = type(plain).load(tmp_path / "model.zip")
+    expected = plain_names(model.policy.state_dict())
+    assert expected.keys() == loaded.policy.state_dict().keys()
+    for name, value in loaded.policy.state_dict().items():
+        assert th.equal(value, expected[name]), name
+    for source in (plain.policy.state_dict(), model.policy.state_dict()):  # under either's names
+        model.policy.load_state_dict(source)
+        plain.policy.load_state_dict(source)
+    wrong = plain.policy.state_dict()
+    wrong["actor.latent_pi.0.weight_mask"] = th.ones_like(wrong["actor.latent_pi.0.weight_mask"])
+    with pytest.raises(CorruptStateError, match="the mask of actor.latent_pi.0 has 72 of 72"):
+        model.policy.load_state_dict(wrong)
+
+
+def test_a_compression_knows_the_model_again():
+    plain, wrapped = compiled("PPO")
+    assert fingerprint(wrapped) == fingerprint(plain)
 
 
 @pytest.mark.parametrize("compute", ["masked", "sparse"])
