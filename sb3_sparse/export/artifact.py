@@ -26,7 +26,7 @@ from sb3_sparse.export.dense import write_dense
 from sb3_sparse.export.graph import Graph
 from sb3_sparse.export.npz import write_npz
 from sb3_sparse.export.observations import Observations, count_of, row_of
-from sb3_sparse.export.parity import Actor
+from sb3_sparse.export.parity import Actor, ParityError
 from sb3_sparse.export.units import sort_units
 from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.policies.mixin import SparsePolicyMixin
@@ -119,7 +119,15 @@ def dense_artifact(model: BaseAlgorithm, normalised: bool) -> Artifact:
     content = write_dense(model)
 
     def actor() -> Actor:
-        stock = load_without_buffer(type(model), io.BytesIO(content), device="cpu")
+        try:
+            stock = load_without_buffer(type(model), io.BytesIO(content), device="cpu")
+        except RuntimeError as error:  # torch's, of a state_dict that does not fit
+            what = " ".join(str(error).split()).rstrip(". ")  # torch writes several lines
+            raise ParityError(
+                f"stock SB3 cannot load the policy as a dense zip: {what}. The policy has other "
+                "parameters than its class makes, as after layers were parametrized or replaced "
+                "later; build them in the policy's arguments, or export to c, numpy or onnx"
+            ) from error
         return predictor(stock, None)
 
     notes = ["trained on in stock SB3, it is dense: nothing keeps the zeros"]

@@ -23,6 +23,7 @@ from sb3_sparse.export.nodes import (
     Flatten,
     Linear,
     MaxPool,
+    Multiply,
     Node,
     Normalize,
     OneHot,
@@ -125,7 +126,7 @@ class _Writer:
             self._elementwise(node, x, y, _size(node), fields)
         elif isinstance(node, Activation):
             self._elementwise(node, x, y, _size(node), node.fields())
-        elif isinstance(node, Add):
+        elif isinstance(node, (Add, Multiply)):
             self._elementwise(node, x, y, f"{_size(node)}, {self._place(node.inputs[1])}", {})
         elif isinstance(node, Positive):
             self._elementwise(node, x, y, _size(node), {})

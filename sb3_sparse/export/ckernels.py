@@ -119,6 +119,7 @@ ELEMENTWISE = {
     "hardshrink": (", float most", "fabsf(x[i]) <= most ? 0.0f : x[i]"),
     "threshold": (", float most, float instead", "x[i] <= most ? instead : x[i]"),
     "add": (", const float *z", "x[i] + z[i]"),
+    "multiply": (", const float *z", "x[i] * z[i]"),
     "positive": ("", "x[i] > 0.0f ? 1.0f : 0.0f"),
 }
 PER_UNIT = {

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import torch as th
 from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -70,7 +71,8 @@ def graph_of(model: BaseAlgorithm, normalization: VecNormalize | None) -> Graph:
 def check_model(model: BaseAlgorithm) -> None:
     """Refuse a model that nothing good can come of.
 
-    :raises UnsupportedError: for an algorithm that is not supported
+    :raises UnsupportedError: for an algorithm that is not supported, or weights that are not
+        float32
     :raises Diverged: if a weight is not finite
     :raises CorruptStateError: if a weight is not 0 where its mask has nothing
     """
@@ -82,6 +84,12 @@ def check_model(model: BaseAlgorithm) -> None:
         )
     policy = unwrapped(model.policy)
     check_finite(policy.state_dict(), "the model")
+    for name, parameter in policy.named_parameters():
+        if parameter.dtype != th.float32:
+            raise UnsupportedError(
+                f"{name} is of {parameter.dtype}, and SB3 gives a policy float32 only: "
+                "model.predict fails, too. Call policy.float() before the export"
+            )
     if not isinstance(policy, SparsePolicyMixin):
         return
     for layer in policy.sparse.layers:

@@ -11,7 +11,7 @@ import torch as th
 from torch import fx, nn
 
 from sb3_sparse.export.activations import called, scaled
-from sb3_sparse.export.nodes import Add
+from sb3_sparse.export.nodes import Add, Multiply
 
 if TYPE_CHECKING:
     from sb3_sparse.export.trace import Tracer
@@ -23,6 +23,7 @@ DIVIDE = (operator.truediv, operator.itruediv, th.div, "div", "div_")
 NEGATE = (operator.neg, th.neg, "neg")
 IN_PLACE = (operator.iadd, operator.isub, operator.imul, operator.itruediv)
 CONCAT = (th.cat, th.concat, th.concatenate)
+SQUARE = (operator.pow, th.pow, "pow", th.square, "square")
 RESHAPE = ("view", "reshape", th.reshape)
 
 
@@ -88,10 +89,14 @@ def _call(
     if target in RESHAPE:
         flat = _flattens(tracer, inputs[0], arguments[1:], sizes) and not options
         return tracer.walk(nn.Flatten(), inputs[0]) if flat else None
-    if len(inputs) == 2 and len(arguments) == 2 and target in ADD and not options:
+    if target in SQUARE and arguments[1:] in ([], [2]) and not options:
+        return tracer.add(Multiply((inputs[0], inputs[0]), tracer.shape_of(inputs[0])))
+    if len(inputs) == 2 and len(arguments) == 2 and target in (*ADD, *MULTIPLY) and not options:
         shape = tracer.shape_of(inputs[0])
-        same = shape == tracer.shape_of(inputs[1])
-        return tracer.add(Add((inputs[0], inputs[1]), shape)) if same else None
+        if shape != tracer.shape_of(inputs[1]):
+            return None
+        kind = Add if target in ADD else Multiply
+        return tracer.add(kind((inputs[0], inputs[1]), shape))
     if len(inputs) != 1 or len(node.all_input_nodes) != 1:
         return None
     (value,) = inputs

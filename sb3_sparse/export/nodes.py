@@ -211,6 +211,13 @@ class Add(Node):
 
 
 @dataclass(frozen=True, eq=False)
+class Multiply(Node):
+    """The product of two values, element by element."""
+
+    op = "multiply"
+
+
+@dataclass(frozen=True, eq=False)
 class Concat(Node):
     """Values behind each other."""
 

@@ -57,6 +57,7 @@ OPERATIONS = {  # of a node's arrays and its inputs, whose last axis is the batc
     "one_hot": lambda n, x: (np.repeat(x, n["sizes"], 0) == n["values"]).astype(np.float32),
     "concat": lambda n, *x: np.concatenate(x),
     "add": lambda n, x, y: x + y,
+    "multiply": lambda n, x, y: x * y,
     "argmax": lambda n, x: np.stack([p.argmax(0) for p in np.split(x, n["splits"])]),
     "positive": lambda n, x: (x > 0).astype(np.int64),
 }

@@ -20,6 +20,7 @@ from sb3_sparse.export.nodes import (
     Flatten,
     Linear,
     MaxPool,
+    Multiply,
     Node,
     Normalize,
     OneHot,
@@ -156,8 +157,8 @@ class _Writer:
             self.node(kinds[1], [half, self.array(second)], output)
         elif isinstance(node, Flatten):
             self.node("Flatten", inputs, output)
-        elif isinstance(node, Add):
-            self.node("Add", inputs, output)
+        elif isinstance(node, (Add, Multiply)):
+            self.node("Add" if isinstance(node, Add) else "Mul", inputs, output)
         elif isinstance(node, Concat):
             self.node("Concat", inputs, output, axis=1)
         elif isinstance(node, Slice):

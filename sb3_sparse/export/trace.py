@@ -40,7 +40,7 @@ COMPACT = (CompactLinear.forward, ChainedSequential.forward)
 """These compute what torch's do."""
 ALLOWED = (
     f"Linear, Conv2d, MaxPool2d, Flatten, BatchNorm, Dropout, {NAMES}, and modules whose forward "
-    "does nothing but call these, add, flatten, concatenate, and multiply by numbers"
+    "does nothing but call these, add, multiply, square, flatten and concatenate"
 )
 
 

@@ -19,6 +19,7 @@ from sb3_sparse.export.nodes import (
     Flatten,
     Linear,
     MaxPool,
+    Multiply,
     Node,
     Normalize,
     PerUnit,
@@ -115,7 +116,7 @@ class _Constants:
                 self.source[value] = self.source[node.inputs[0]]
             if isinstance(node, Weighted):
                 self.known[value] = self._of_layer(node)
-            elif isinstance(node, (Add, Concat)):
+            elif isinstance(node, (Add, Multiply, Concat)):
                 for operand in node.inputs:
                     self.pinned[self.source[operand]][:] = True
                 self.pinned[value][:] = True

@@ -136,6 +136,23 @@ class Wild(OwnExtractor):
         return -self.second(x.view(x.size(0), -1)).reshape(x.shape[0], -1)
 
 
+class Swish(nn.Module):
+    def forward(self, x):
+        return x * th.sigmoid(1.702 * x)
+
+
+class SquaredReLU(nn.ReLU):
+    def forward(self, x):
+        return super().forward(x) ** 2 + th.square(0.1 * x)
+
+
+@pytest.mark.parametrize("activation", [Swish, SquaredReLU])
+@pytest.mark.parametrize("to", ["c", "numpy", "onnx"])
+def test_activations_of_ones_own(activation, to, tmp_path):
+    model = make("SAC", policy_kwargs=dict(activation_fn=activation, sparsity=0.5))
+    assert export(model, tmp_path / "policy", to).parity.holds
+
+
 class Residual(nn.Sequential):
     def forward(self, x):
         return x + super().forward(x)
@@ -175,9 +192,9 @@ class Normed(OwnExtractor):
         self.second = nn.LayerNorm(16)
 
 
-class Gated(OwnExtractor):
+class Sine(OwnExtractor):
     def forward(self, observations):
-        return self.first(observations) * self.first(observations)
+        return th.sin(self.first(observations))
 
 
 class Twice(OwnExtractor):
@@ -195,7 +212,7 @@ class AlwaysDropped(OwnExtractor):
     [
         (WithNoisy, r"features_extractor.second \(Noisy\) cannot be exported: .*; allowed are Lin"),
         (Normed, r"features_extractor.second \(LayerNorm\) cannot be exported; allowed are Linear"),
-        (Gated, r"features_extractor \(Gated\) .*: its forward calls mul\(\); allowed"),
+        (Sine, r"features_extractor \(Sine\) .*: its forward calls sin\(\); allowed"),
         (Twice, r"features_extractor \(Twice\) .*: its forward calls view\(-1, 32\); allowed"),
         (AlwaysDropped, r"features_extractor \(AlwaysDropped\) .* calls dropout\("),
     ],

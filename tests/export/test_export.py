@@ -23,7 +23,7 @@ from sb3_sparse.errors import (
     SparsityError,
     UnsupportedError,
 )
-from sb3_sparse.export import ParityError, export, record_observations
+from sb3_sparse.export import FORMATS, ParityError, export, record_observations
 from sb3_sparse.export.artifact import compiled
 from sb3_sparse.export.extract import graph_of
 from sb3_sparse.export.parity import compare
@@ -115,6 +115,23 @@ def test_weights_that_are_not_finite_are_refused(tmp_path):
     model.policy.action_net.bias.data[0] = th.nan
     with pytest.raises(Diverged, match="values of action_net.bias are not finite"):
         export(model, tmp_path / "policy")
+
+
+@pytest.mark.parametrize("to", FORMATS)
+def test_weights_that_are_not_float32_are_refused(to, tmp_path):
+    model = make("PPO", policy="MlpPolicy")
+    model.policy.double()
+    with pytest.raises(UnsupportedError, match=r"is of torch.float64.*policy.float\(\) before"):
+        export(model, tmp_path / "policy", to)
+
+
+def test_a_dense_zip_that_stock_sb3_cannot_load_is_not_written(tmp_path):
+    model = make("TD3", policy="MlpPolicy")
+    nn.utils.parametrizations.spectral_norm(model.policy.actor.mu[0])
+    with pytest.raises(ParityError, match="cannot load the policy.*parametrized or replaced later"):
+        export(model, tmp_path / "policy", "dense", force=True)
+    assert written(tmp_path) == []
+    assert export(model, tmp_path / "policy", "c").parity.holds
 
 
 def test_other_algorithms_are_refused(tmp_path):
