@@ -34,7 +34,9 @@ def test_a_study_of_ones_own_is_run_looked_at_and_reported(tmp_path):
     (tmp_path / "mine.yml").write_text(yaml.safe_dump(CELLS))
     which = ["mine.yml", "--scale", "smoke"]
     waiting = call("study", "status", *which, cwd=tmp_path)
-    assert "0 done, 0 running, 0 stopped, 0 failed, 2 waiting" in waiting.stdout, waiting.stderr
+    assert "0 done, 0 diverged, 0 running, 0 stopped, 0 failed, 2 waiting" in waiting.stdout, (
+        waiting.stderr
+    )
 
     done = call("study", "run", *which, "--workers", "2", cwd=tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from sb3_sparse.experiments import Study
     from sb3_sparse.experiments.standing import CellStanding
 
+OVER = ("done", "diverged")
 studies = typer.Typer(no_args_is_help=True)
 Name = Annotated[str, typer.Argument(help="A name of `study list`, or a file of your own, .yml.")]
 Scale = Annotated[
@@ -88,6 +89,8 @@ def run(
         console.print(f"\nFailed twice: {'; '.join(runs)}", style="bold")
         console.print(error, soft_wrap=True)
     console.print(f"{last.done} of {last.planned} runs are done.")
+    if last.diverged:
+        console.print(f"{last.diverged} diverged, and are over; the report names them.")
     if last.done:
         console.print(
             f"Draw them: {_command('report', name, scale, store, packages)}", soft_wrap=True
@@ -106,6 +109,7 @@ def status(
     """How far a study is, and which of its runs failed."""
     from sb3_sparse.experiments import Study
     from sb3_sparse.experiments.standing import FAILED, RUNNING, STOPPED, counts
+    from sb3_sparse.zoo.record import DIVERGED
 
     packages = gym_packages or []
     study = Study.read(name, scale, packages)
@@ -120,6 +124,8 @@ def status(
     for one in standings:
         if one.status in (RUNNING, STOPPED):
             console.print(f"{one.status}: {one.cell.name}, {one.steps} steps")
+        if one.status == DIVERGED:
+            console.print(f"diverged: {one.cell.name}, at step {one.steps}", soft_wrap=True)
         if one.status == FAILED:
             why = one.reason or f"see {one.cell.errors(store)}"
             console.print(f"failed: {one.cell.name}; {why}", soft_wrap=True)
@@ -153,7 +159,7 @@ def report(
         figures=study.figures,
         varies=study.varies,
         command=_command("run", name, scale, store, packages),
-        pending=[_pending(one, store) for one in standings if one.status != "done"],
+        pending=[_pending(one, store) for one in standings if one.status not in OVER],
     )
     console.print(f"Written: {page}", soft_wrap=True)
 

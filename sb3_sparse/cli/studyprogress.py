@@ -44,7 +44,10 @@ class StudyProgress:
             done = f"{progress.done} of {progress.planned}"
             line = f"{done}: {progress.ended}; {time_left(progress)}"
             self.console.print(line, soft_wrap=True)
-        status = f"{progress.running} running, {len(progress.failed)} failed, {time_left(progress)}"
+        status = (
+            f"{progress.running} running, {progress.diverged} diverged, "
+            f"{len(progress.failed)} failed, {time_left(progress)}"
+        )
         self.bar.update(self.task, completed=progress.done, status=status)
 
     def close(self) -> None:

@@ -11,6 +11,7 @@ from sb3_sparse.experiments.cell import Cell
 from sb3_sparse.experiments.spec import Study
 from sb3_sparse.experiments.standing import DONE, RUNNING, standing_of
 from sb3_sparse.launch.base import Ended, Launcher, Task
+from sb3_sparse.zoo.record import DIVERGED
 
 FUNCTION = "sb3_sparse.experiments.work:work_on"
 
@@ -23,6 +24,7 @@ class Progress:
     :param done: cells that are done, before this start too
     :param elsewhere: cells that another process trains
     :param running: cells that are trained now
+    :param diverged: cells whose training diverged, before this start too
     :param failed: cells that failed twice, with their tracebacks
     :param retried: names of cells that failed once
     :param ended: the cell that has just ended, if one has
@@ -32,6 +34,7 @@ class Progress:
     done: int = 0
     elsewhere: int = 0
     running: int = 0
+    diverged: int = 0
     failed: dict[str, str] = field(default_factory=dict)
     retried: list[str] = field(default_factory=list)
     ended: str | None = None
@@ -41,7 +44,7 @@ class Progress:
     @property
     def open(self) -> int:
         """Cells that are still to be done here."""
-        return self.planned - self.done - self.elsewhere - len(self.failed)
+        return self.planned - self.done - self.diverged - self.elsewhere - len(self.failed)
 
     @property
     def seconds_left(self) -> float | None:
@@ -56,9 +59,9 @@ def run_study(
 ) -> Generator[Progress, None, None]:
     """Bring every cell of a study to its end; yields how far it is, about once a second.
 
-    A cell that is done is not run again, an interrupted one goes on, one that fails is tried a
-    second time after all others. Closing the iterator stops the cells that are running at their
-    next rollout; the next call goes on with them.
+    A cell that is done or diverged is not run again, an interrupted one goes on, one that fails is
+    tried a second time after all others. Closing the iterator stops the cells that are running at
+    their next rollout; the next call goes on with them.
 
     :param study: what to run
     :param store: folder of the studies' runs, which studies share
@@ -68,9 +71,10 @@ def run_study(
     progress = Progress(len(study.cells))
     cells = []
     for cell in study.cells:
-        if standing_of(cell, store).status == DONE:
-            progress.done += 1
-        else:
+        status = standing_of(cell, store).status
+        progress.done += status == DONE
+        progress.diverged += status == DIVERGED
+        if status not in (DONE, DIVERGED):
             cells.append(cell)
     yield progress
     again: list[Cell] = []
@@ -107,8 +111,9 @@ def _account(progress: Progress, cell: Cell, store: Path, ended: Ended, last: bo
             progress.failed[cell.name] = ended.error
         return
     progress.ended = cell.name
-    if ended.value == DONE:
-        progress.done += 1
+    if ended.value in (DONE, DIVERGED):
+        progress.done += ended.value == DONE
+        progress.diverged += ended.value == DIVERGED
         progress.finished_here += 1
     elif ended.value == RUNNING:
         progress.elsewhere += 1

@@ -12,9 +12,10 @@ from sb3_sparse.errors import SparsityError
 from sb3_sparse.experiments.cell import Cell
 from sb3_sparse.loading.guard import reading
 from sb3_sparse.zoo.checkpoint import is_locked
-from sb3_sparse.zoo.record import CURE, NAME, WHAT, read_record
+from sb3_sparse.zoo.record import CURE, DIVERGED, NAME, WHAT, read_record
 
 DONE, RUNNING, STOPPED, FAILED, WAITING = "done", "running", "stopped", "failed", "waiting"
+STATUSES = (DONE, DIVERGED, RUNNING, STOPPED, FAILED, WAITING)
 OVER = {True: "finished", False: "counted"}
 
 
@@ -25,7 +26,7 @@ class CellStanding:
     :param cell: which
     :param folder: its run's folder, there or not
     :param status: ``"done"``, ``"running"`` (some process trains it now), ``"stopped"`` (it goes on
-        from its last checkpoint), ``"failed"`` or ``"waiting"``
+        from its last checkpoint), ``"diverged"`` (it is over), ``"failed"`` or ``"waiting"``
     :param steps: environment steps done
     :param reason: what is wrong with its record; None: nothing, or it failed in training
     """
@@ -56,6 +57,8 @@ def standing_of(cell: Cell, store: Path) -> CellStanding:
         return CellStanding(cell, folder, FAILED, reason=told)
     if running:
         return CellStanding(cell, folder, RUNNING, steps)
+    if record["status"] == DIVERGED:
+        return CellStanding(cell, folder, DIVERGED, steps)
     if record["status"] == OVER[cell.trained] and not missing:
         return CellStanding(cell, folder, DONE, steps)
     return CellStanding(cell, folder, FAILED if failed else STOPPED, steps)
@@ -64,4 +67,4 @@ def standing_of(cell: Cell, store: Path) -> CellStanding:
 def counts(standings: Sequence[CellStanding]) -> dict[str, int]:
     """How many cells there are of each status."""
     found = Counter(one.status for one in standings)
-    return {status: found[status] for status in (DONE, RUNNING, STOPPED, FAILED, WAITING)}
+    return {status: found[status] for status in STATUSES}

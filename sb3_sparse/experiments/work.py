@@ -8,13 +8,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from sb3_sparse.errors import ConfigError, RunBusy
+from sb3_sparse.errors import ConfigError, Diverged, RunBusy
 from sb3_sparse.experiments.cell import Cell
 from sb3_sparse.experiments.measures import FILES
 from sb3_sparse.experiments.standing import DONE, OVER, RUNNING, STOPPED, standing_of
 from sb3_sparse.zoo.checkpoint import LOCK, locked
 from sb3_sparse.zoo.prepare import count
-from sb3_sparse.zoo.record import NAME, read_record, write_record
+from sb3_sparse.zoo.record import DIVERGED, NAME, read_record, write_record
 from sb3_sparse.zoo.run import Run
 
 
@@ -26,7 +26,7 @@ def work_on(cell: Cell, store: Path) -> str:
     :param store: folder of the studies' runs
     """
     standing = standing_of(cell, store)
-    if standing.status in (DONE, RUNNING):
+    if standing.status in (DONE, DIVERGED, RUNNING):
         return standing.status
     folder = standing.folder
     try:
@@ -38,6 +38,9 @@ def work_on(cell: Cell, store: Path) -> str:
             _measure(cell, folder)
     except RunBusy:  # another process has begun it since
         return RUNNING
+    except Diverged:  # which is on record, and would only hide a bad setting if tried again
+        cell.errors(store).unlink(missing_ok=True)
+        return DIVERGED
     cell.errors(store).unlink(missing_ok=True)
     return DONE
 

@@ -17,15 +17,14 @@ import numpy.typing as npt
 from sb3_sparse.errors import ConfigError, CorruptStateError, SparsityError
 from sb3_sparse.loading.arrays import read_arrays
 from sb3_sparse.loading.guard import reading
+from sb3_sparse.report.complete import FINISHED, check_complete, check_reached
 from sb3_sparse.report.measured import Rows, read_rows
 from sb3_sparse.report.methods import DENSE, EQUAL
 from sb3_sparse.report.settings import WIDTHS, callback_of, family_of, overrides_of, variant_of
-from sb3_sparse.zoo.record import CURE, NAME, WHAT, read_record
+from sb3_sparse.zoo.record import CURE, DIVERGED, NAME, WHAT, read_record
 from sb3_sparse.zoo.results import score_of
 
 Array = npt.NDArray[np.float64]
-FINISHED, COUNTED, DIVERGED = "finished", "counted", "diverged"
-NEAR = 0.01  # of the connections; what rounds and schedules differ by is far less
 MEASURED = {
     "snr.csv": ("timesteps", "name", "value"),
     "plasticity.csv": ("timesteps", "name", "value"),
@@ -39,10 +38,16 @@ class LeftOut:
 
     :param folder: the run's folder
     :param reason: why
+    :param diverged: whether its training ended in NaN
     """
 
     folder: Path
     reason: str
+    diverged: bool = False
+
+
+class _DivergedRun(ConfigError):
+    """A run whose training ended in NaN."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,7 +184,8 @@ def read_runs(folders: Iterable[Path | str]) -> tuple[list[RunData], list[LeftOu
         try:
             run, remarks = _read(folder)
         except SparsityError as error:
-            out.append(LeftOut(folder, str(error).replace(f"{folder}{os.sep}", "")))
+            told = str(error).replace(f"{folder}{os.sep}", "")
+            out.append(LeftOut(folder, told, isinstance(error, _DivergedRun)))
             continue
         same = first.setdefault(_identity(run), folder)
         if same != folder:
@@ -194,10 +200,16 @@ def _read(folder: Path) -> tuple[RunData, list[str]]:
     if not folder.is_dir():
         raise ConfigError("missing: there is no such folder")
     record = read_record(folder)
-    with reading(folder / NAME, WHAT, CURE):
-        _check(record)
-        _check_reached(record)
     empty = np.zeros(0)
+    diverged = ""
+    with reading(folder / NAME, WHAT, CURE):
+        check_complete(record)
+        if record["status"] == DIVERGED:
+            diverged = _divergence(RunData(folder, record, empty, empty))
+        else:
+            check_reached(record)
+    if diverged:
+        raise _DivergedRun(diverged)
     timesteps, returns = empty, empty
     if record["status"] == FINISHED:
         timesteps, returns = _evaluations(folder / "evaluations.npz")
@@ -214,44 +226,11 @@ def _read(folder: Path) -> tuple[RunData, list[str]]:
     return run, remarks
 
 
-def _check(record: Mapping[str, Any]) -> None:
-    """A record that all figures can rely on."""
-    status = record.get("status")
-    if status == "failed":
-        raise ConfigError(f"failed: {record.get('error') or 'no reason is recorded'}")
-    if status == DIVERGED:
-        raise ConfigError(f"diverged: {record.get('error') or 'no step is recorded'}")
-    if status not in (FINISHED, COUNTED):
-        raise ConfigError(f"not finished: its status is {status!r}")
-    for name in ("run", "settings", "total", "layers", "method"):
-        if not record.get(name):
-            raise ConfigError(f"{NAME} is incomplete: {name!r} is missing")
-    needed = {"run": ("algo", "env_id", "seed"), "total": ("sparsity", "parameters", "flops")}
-    for part, names in needed.items():
-        for name in names:
-            if not isinstance(record[part], dict) or record[part].get(name) is None:
-                raise ConfigError(f"{NAME} is incomplete: {part}.{name} is missing")
-
-
-def _check_reached(record: Mapping[str, Any]) -> None:
-    """Refuse a run whose networks are not as sparse as its settings say.
-
-    Runs of before ``wanted_nnz`` was recorded can only have stayed too dense after a denser start.
-    """
-    total, kwargs = record["total"], record["settings"].get("policy_kwargs", {})
-    reached, asked = float(total["sparsity"]), kwargs.get("sparsity")
-    wanted = total.get("wanted_nnz")
-    if wanted is not None:
-        missed = abs(int(total["nnz"]) - int(wanted)) > NEAR * int(wanted)
-    else:
-        denser = kwargs.get("initial_sparsity") is not None and isinstance(asked, (int, float))
-        missed = denser and reached < asked - NEAR
-    if missed:
-        raise ConfigError(
-            f"its sparsity is {reached:.2%}, not the {asked} that its settings ask for: it was not "
-            "pruned, or not to the end; train it again with a callback that prunes, longer or with "
-            "a smaller update_interval"
-        )
+def _divergence(run: RunData) -> str:
+    """What diverged and when, in one line."""
+    level = "" if run.label == DENSE else f" {run.level:.0%}"
+    which = f"{run.algo.upper()} on {run.env_id}, {run.label}{level}, seed {run.seed}"
+    return f"{which}: {run.record.get('error') or 'training diverged, no step is recorded'}"
 
 
 def _try_out(run: RunData) -> None:

@@ -62,6 +62,16 @@ class Content:
     pending: Sequence[str]
     command: str
 
+    @property
+    def diverged(self) -> list[LeftOut]:
+        """Runs whose training ended in NaN."""
+        return [one for one in self.left_out if one.diverged]
+
+    @property
+    def others(self) -> list[LeftOut]:
+        """What else is not in the report."""
+        return [one for one in self.left_out if not one.diverged]
+
 
 def render(content: Content) -> str:
     """The page's HTML."""
@@ -82,6 +92,7 @@ def render(content: Content) -> str:
             f"{html.link('verdicts.csv', 'verdicts.csv')}</p>",
         ),
         _normalisation(study),
+        *_diverged(content),
         _left_out(content),
     ]
     if content.pending or content.command:
@@ -100,7 +111,8 @@ def _counts(content: Content) -> str:
     also = f", and {counted} only counted" if counted else ""
     return (
         f"Finished runs: {len(runs)}{also}; seeds: {seeds}; environments: {envs}; environment "
-        f"steps: {steps:,}; left out: {len(content.left_out)}; pending: {len(content.pending)}."
+        f"steps: {steps:,}; diverged: {len(content.diverged)}; left out: {len(content.others)}; "
+        f"pending: {len(content.pending)}."
     )
 
 
@@ -152,8 +164,19 @@ def _normalisation(study: Study) -> str:
     return html.section("Scores and normalisation", *parts)
 
 
+def _diverged(content: Content) -> list[str]:
+    if not content.diverged:
+        return []
+    texts = [f"{one.folder}: {one.reason}" for one in content.diverged]
+    warning = (
+        "Training of these ended in NaN. They have no score, so no figure, table or verdict holds "
+        "them: what is averaged are the other seeds, which flatters settings that diverge."
+    )
+    return [html.section("Diverged", html.paragraph(warning), html.listing(texts))]
+
+
 def _left_out(content: Content) -> str:
-    texts = [f"{one.folder}: {one.reason}" for one in content.left_out]
+    texts = [f"{one.folder}: {one.reason}" for one in content.others]
     parts = [html.listing(texts) if texts else html.paragraph("No run folder was left out.")]
     if content.study.remarks:
         parts += [

@@ -12,7 +12,7 @@ from statistics import fmean
 
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_sparse.errors import ConfigError
+from sb3_sparse.errors import ConfigError, Diverged
 from sb3_sparse.tuning.backend import Trial, optuna
 from sb3_sparse.tuning.spaces import Space, with_values
 from sb3_sparse.zoo.checkpoint import clear_checkpoints
@@ -55,7 +55,7 @@ class Objective:
     def __call__(self, trial: Trial) -> float:
         """Train, and return the mean score of the seeds.
 
-        :raises optuna.TrialPruned: where the study's pruner says so
+        :raises optuna.TrialPruned: where the study's pruner says so, or training diverges
         :raises KeyboardInterrupt: after SIGINT or SIGTERM, when the rollout at hand is over
         """
         began = time.monotonic()
@@ -75,6 +75,9 @@ class Objective:
                 clear_checkpoints(evaluations.parent.folder)
                 write_record(evaluations.parent.folder, status="pruned", error=None)
                 raise
+            except Diverged as error:  # a result: these values train nothing
+                trial.set_user_attr("diverged", str(error))
+                raise optuna.TrialPruned(str(error)) from error
             if not outcome.finished:
                 raise KeyboardInterrupt
             scores.append(score_of(evaluations.returns))

@@ -17,6 +17,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_sparse.errors import RunBusy
+from sb3_sparse.zoo.divergence import check_networks
 from sb3_sparse.zoo.evaluation import Evaluation
 from sb3_sparse.zoo.record import write_record
 from sb3_sparse.zoo.replay import BufferSaver
@@ -70,7 +71,11 @@ class Checkpoints(BaseCallback):
         return True
 
     def save(self) -> None:
-        """Save the model as it is now."""
+        """Save the model as it is now.
+
+        :raises Diverged: if its networks hold NaN; the checkpoint before stays
+        """
+        check_networks(self.model)
         final = self.parent_folder / str(self.model.num_timesteps)
         if final.exists():
             return
@@ -223,6 +228,20 @@ def _can_lock(descriptor: int) -> bool:
     except BlockingIOError:
         return False
     return True
+
+
+def keep_last_finite(folder: Path, env_name: str) -> int | None:
+    """Make the model of the last checkpoint a diverged run's last policy.
+
+    :return: after how many environment steps it was saved; None if there is no checkpoint
+    """
+    checkpoint = last_checkpoint(folder)
+    if checkpoint is None:
+        return None
+    shutil.copy(checkpoint / f"{env_name}.zip", folder / f"{env_name}.zip")
+    for path in (checkpoint / env_name).iterdir():  # its normalisation
+        shutil.copy(path, folder / env_name / path.name)
+    return int(checkpoint.name)
 
 
 def clear_checkpoints(folder: Path) -> None:

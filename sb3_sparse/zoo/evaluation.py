@@ -18,6 +18,7 @@ from sb3_sparse.loading.guard import reading
 from sb3_sparse.loading.text import read_json
 from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.policies.mixin import SparsePolicyMixin
+from sb3_sparse.zoo.divergence import check_networks, check_return
 
 NPZ = "evaluations.npz"
 BEST = "best_model.zip"
@@ -74,6 +75,9 @@ class Evaluated:
 
 class Evaluation(EvalCallback):
     """SB3's EvalCallback at fixed environment steps; goes on where an interrupted run was.
+
+    Networks that hold NaN are not evaluated: the training ends with
+    :class:`~sb3_sparse.errors.Diverged`.
 
     ``best_model.zip`` is the best policy of the sparsity asked for: while pruning is under way,
     policies are evaluated and logged but not kept.
@@ -155,12 +159,15 @@ class Evaluation(EvalCallback):
         if self.num_timesteps < self.next:
             return True
         self.next = (self.num_timesteps // self.every + 1) * self.every
+        check_networks(self.model)
         policy = unwrapped(self.model.policy)
         assert isinstance(policy, SparsePolicyMixin)
         if not any(network.denser for network in policy.sparse.networks):
-            return super()._on_step()
-        kept, self.best_model_save_path = self.best_model_save_path, None
-        go_on = super()._on_step()
-        self.best_model_save_path = kept
-        self.best_mean_reward = -np.inf
+            go_on = super()._on_step()
+        else:
+            kept, self.best_model_save_path = self.best_model_save_path, None
+            go_on = super()._on_step()
+            self.best_model_save_path = kept
+            self.best_mean_reward = -np.inf
+        check_return(self.last_mean_reward, self.num_timesteps)
         return go_on

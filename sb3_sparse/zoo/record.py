@@ -18,6 +18,8 @@ NAME = "sparsity.json"
 WHAT = "record of a run"
 CURE = "restore it from a copy, or remove the run's folder and train anew"
 FORMAT = 1
+DIVERGED = "diverged"
+"""Status of a run whose networks came to hold NaN: it is over, and nothing of it is averaged."""
 PACKAGES = (
     "sb3-sparse",
     "stable-baselines3",

@@ -14,6 +14,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
+from sb3_sparse.zoo.divergence import check_return
 from sb3_sparse.zoo.run import Run
 
 FINAL_EPISODES = 20
@@ -94,4 +95,5 @@ def _evaluate(
     )
     assert not isinstance(mean, list)
     assert not isinstance(std, list)
+    check_return(mean, model.num_timesteps)
     return Result(what, float(mean), float(std), FINAL_EPISODES, path)

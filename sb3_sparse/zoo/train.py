@@ -4,30 +4,32 @@ from __future__ import annotations
 
 import importlib.util
 import shutil
-from collections.abc import Sequence
-from contextlib import ExitStack
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict
 from pathlib import Path
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_sparse.errors import ConfigError
+from sb3_sparse.errors import ConfigError, Diverged, SparsityError
 from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.policies.mixin import SparsePolicyMixin
 from sb3_sparse.zoo.checkpoint import (
     Checkpoints,
     StopTraining,
     clear_checkpoints,
+    keep_last_finite,
     last_checkpoint,
     locked,
     restored_monitors,
 )
+from sb3_sparse.zoo.divergence import check_networks
 from sb3_sparse.zoo.evaluation import Evaluated, Evaluation
 from sb3_sparse.zoo.experiment import Experiment, spaces_of
 from sb3_sparse.zoo.plan import check_start, planned
 from sb3_sparse.zoo.prepare import doubt, explained, prepare
-from sb3_sparse.zoo.record import NAME, read_record, sparsity_of, write_record
+from sb3_sparse.zoo.record import DIVERGED, NAME, read_record, sparsity_of, write_record
 from sb3_sparse.zoo.results import Outcome, final_results
 from sb3_sparse.zoo.run import Run
 from sb3_sparse.zoo.speed import denormals_as_zero, use_few_threads
@@ -53,6 +55,7 @@ def train(
     :param folder: the run's own folder, ``.../<algo>/<name>``, in place of the next free number in
         ``log_folder``; nothing else may be in it
     :raises ConfigError: if the environment cannot be made or the algorithm cannot act in it
+    :raises Diverged: if networks come to hold NaN; the record has the status ``"diverged"``
     """
     if tensorboard_log and importlib.util.find_spec("tensorboard") is None:
         raise ConfigError("--tensorboard-log needs TensorBoard: pip install tensorboard")
@@ -83,6 +86,9 @@ def train(
                 experiment = Experiment(run, settings, folder, evaluation, None, tensorboard_log)
                 model = experiment.setup()
             return _learn(run, experiment, model, folder, None, callbacks, after_evaluation)
+        except Diverged as error:
+            assert model is not None
+            raise _recorded(folder, error, model, experiment.env_name) from error
         except Exception as error:
             if model is None or model.num_timesteps == 0:
                 shutil.rmtree(folder)  # nothing was trained
@@ -95,7 +101,9 @@ def resume(folder: Path, callbacks: Sequence[BaseCallback] = ()) -> Outcome:
     """Go on with an interrupted run from its last checkpoint, or from the start if it has none.
 
     :param folder: the run's folder
-    :raises ConfigError: if there is no run, if it is finished, or if another process trains it
+    :raises ConfigError: if there is no run, if it is finished or diverged, or if another process
+        trains it
+    :raises Diverged: if it diverges now
     """
     read_record(folder)
     with locked(folder):
@@ -106,6 +114,8 @@ def resume(folder: Path, callbacks: Sequence[BaseCallback] = ()) -> Outcome:
                 f"the run in {folder} is finished; look at it with sb3-sparse enjoy {folder}, or "
                 "train longer anew with -n"
             )
+        if record["status"] == DIVERGED:
+            raise ConfigError(f"the run in {folder} has ended: {record['error']}")
         plan = planned(folder, record)
         run, settings, evaluation = plan.run, plan.settings, plan.evaluation
         start = folder if record.get("trained") else last_checkpoint(folder)
@@ -125,6 +135,8 @@ def resume(folder: Path, callbacks: Sequence[BaseCallback] = ()) -> Outcome:
             model = experiment.setup()
         try:
             return _learn(run, experiment, model, folder, start, callbacks)
+        except Diverged as error:
+            raise _recorded(folder, error, model, experiment.env_name) from error
         except Exception as error:
             _record_failure(folder, error)
             raise
@@ -132,6 +144,24 @@ def resume(folder: Path, callbacks: Sequence[BaseCallback] = ()) -> Outcome:
 
 def _record_failure(folder: Path, error: Exception) -> None:
     write_record(folder, status="failed", error=f"{type(error).__name__}: {error}")
+
+
+def _recorded(folder: Path, error: Diverged, model: BaseAlgorithm, env_name: str) -> Diverged:
+    """Write down that a run diverged, and keep its last policy of numbers; what to raise."""
+    step = keep_last_finite(folder, env_name)
+    kept = (
+        "no policy was saved before" if step is None else f"the last policy is that of step {step}"
+    )
+    text = f"{error}. In {folder} {kept}"
+    write_record(
+        folder,
+        status=DIVERGED,
+        error=text,
+        num_timesteps=model.num_timesteps,
+        last_policy=step,
+    )
+    clear_checkpoints(folder)
+    return Diverged(text)
 
 
 def _learn(
@@ -171,13 +201,14 @@ def _learn(
         if done < planned:
             status = "evaluating"
             try:
-                with checkpoints.on_signals(), denormals_as_zero():
+                with checkpoints.on_signals(), denormals_as_zero(), _diverging(model):
                     model.learn(
                         planned - done,
                         callback=[*experiment.callbacks, evaluation, checkpoints, *callbacks],
                         reset_num_timesteps=start is None,
                         tb_log_name=f"{run.algo}_{folder.name}",
                     )
+                    check_networks(model)
             except StopTraining:
                 status = "interrupted"
         path = experiment.save(model)
@@ -200,6 +231,23 @@ def _learn(
     )
     clear_checkpoints(folder)
     return Outcome(folder, model, results)
+
+
+@contextmanager
+def _diverging(model: BaseAlgorithm) -> Iterator[None]:
+    """Within it, an error of networks that hold NaN, which may say anything, is said to be that."""
+    try:
+        yield
+    except SparsityError:
+        raise
+    except StopTraining:
+        raise
+    except Exception as error:
+        try:
+            check_networks(model)
+        except Diverged as diverged:
+            raise diverged from error
+        raise
 
 
 def new_run_folder(parent: Path, env_name: str) -> Path:

@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_sparse.experiments import Study, run_study, standing_of
 from sb3_sparse.experiments.noise import noisy_envs
-from sb3_sparse.experiments.standing import CellStanding
+from sb3_sparse.experiments.standing import CellStanding, counts
 from sb3_sparse.experiments.work import work_on
 from sb3_sparse.launch.base import Ended, Launcher, Task
 from sb3_sparse.zoo.checkpoint import locked
@@ -140,6 +140,21 @@ def test_a_cell_that_fails_twice_is_reported_with_its_traceback_and_the_others_g
     assert made.cells[0].errors(store).read_text().count("Traceback: it broke") == 2
     again = finish(made, store)  # the next start tries it anew
     assert (again.done, again.failed) == (2, {})
+
+
+def test_a_cell_that_diverges_is_over_is_no_failure_and_is_not_tried_again(tmp_path):
+    rates = {"learning_rate": [1e35, 1e-3]}
+    made = study(tmp_path, runs=[{"method": "static", "sparsity": 0.5, "vary": rates}])
+    store, launcher = tmp_path / "store", Here()
+    last = finish(made, store, launcher)
+    assert (last.done, last.diverged, last.failed, last.open) == (1, 1, {}, 0)
+    assert len(launcher.called) == 2
+    again = finish(made, store, launcher)
+    assert (again.done, again.diverged, again.open) == (1, 1, 0)
+    assert len(launcher.called) == 2
+    standings = [standing_of(cell, store) for cell in made.cells]
+    assert sorted(one.status for one in standings) == ["diverged", "done"]
+    assert counts(standings)["diverged"] == 1
 
 
 def test_a_cell_that_another_process_trains_is_left_to_it(tmp_path):

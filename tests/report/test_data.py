@@ -63,6 +63,17 @@ def test_an_older_record_of_a_run_that_stayed_dense_is_named_too(folders):
     assert "its sparsity is 0.00%, not the 0.9" in reasons([folder])[1][folder]
 
 
+def test_a_run_that_diverged_is_named_with_its_step_and_never_averaged(folders):
+    good, bad = folders.add("set", 0.9, 0), folders.add("set", 0.9, 1, status="diverged")
+    path = bad / "sparsity.json"
+    error = "training diverged: at step 600 there is NaN"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "error": error}))
+    runs, (out,) = read_runs([good, bad])
+    assert [run.folder for run in runs] == [good]
+    assert (out.folder, out.diverged) == (bad, True)
+    assert out.reason == f"DQN on CartPole-v1, set 90%, seed 1: {error}"
+
+
 @pytest.mark.parametrize("status", ["running", "evaluating", "interrupted", "failed"])
 def test_an_unfinished_run_is_named(folders, status):
     folder = folders.add(status=status)

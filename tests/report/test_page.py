@@ -125,6 +125,16 @@ def test_what_cannot_be_drawn_again_stays_and_the_page_says_so(name, lost, folde
     assert f"figures/{name}.svg" in page
 
 
+def test_runs_that_diverged_have_a_section_of_their_own(folders, tmp_path):
+    for seed, status in enumerate(["finished", "diverged", "running"]):
+        folders.add("rigl", 0.9, seed, status=status)
+    page = write_report(folders.made, tmp_path / "out", title="T", figures=["iqm"]).read_text()
+    assert "diverged: 1; left out: 1; pending: 0." in page
+    diverged = page.split(">Diverged<")[1].split("</section>")[0]
+    assert "DQN on CartPole-v1, rigl 90%, seed 1: training diverged" in diverged
+    assert "seed 2" not in diverged
+
+
 def test_a_report_on_nothing_is_a_page_all_the_same(tmp_path):
     page = write_report([], tmp_path / "out", title="t", figures=list(FIGURES)).read_text()
     assert page.count("Left out: ") == len(FIGURES)

@@ -82,6 +82,20 @@ def test_a_pruned_trial_stops_and_says_so(tmp_path):
     assert not (record.parent / "resume").exists()
 
 
+def test_a_trial_that_diverges_is_pruned_says_so_and_the_study_goes_on(tmp_path):
+    study = optuna.create_study(
+        sampler=optuna.samplers.GridSampler({"learning_rate": [1e35, 1e-3]})
+    )
+    space = choices(learning_rate=[1e35, 1e-3])
+    study.optimize(Objective(small_run(), space, 1, tmp_path), n_trials=2)
+    ended = {trial.params["learning_rate"]: trial for trial in study.trials}
+    assert ended[1e-3].state == TrialState.COMPLETE
+    assert ended[1e35].state == TrialState.PRUNED
+    assert "training diverged: at step" in ended[1e35].user_attrs["diverged"]
+    (folder,) = (tmp_path / str(ended[1e35].number)).rglob("sparsity.json")
+    assert json.loads(folder.read_text())["status"] == "diverged"
+
+
 def test_a_whole_trial_is_never_pruned_at_its_end(tmp_path):
     class AtTheEnd(optuna.pruners.BasePruner):
         def prune(self, study, trial):

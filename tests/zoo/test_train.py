@@ -16,7 +16,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import load_results
 from support import ALGORITHMS
 
-from sb3_sparse.errors import ConfigError, CorruptStateError
+from sb3_sparse.errors import ConfigError, CorruptStateError, Diverged
 from sb3_sparse.zoo.checkpoint import last_checkpoint
 from sb3_sparse.zoo.enjoy import enjoy
 from sb3_sparse.zoo.record import read_record
@@ -244,6 +244,85 @@ class Break(BaseCallback):
         if self.num_timesteps == self.at:
             raise OSError("no space left")
         return True
+
+
+class Poison(BaseCallback):
+    """Puts a value into a weight at some step, as a loss that explodes does."""
+
+    def __init__(self, at: int, value: float = float("nan")) -> None:
+        super().__init__()
+        self.at, self.value = at, value
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps == self.at:
+            with th.no_grad():
+                parameter = next(self.model.policy.parameters())
+                parameter.view(-1)[0] = self.value
+        return True
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_a_run_that_diverges_says_at_which_step_and_keeps_its_last_policy_of_numbers(
+    value, tmp_path
+):
+    with pytest.raises(Diverged, match="at step 600 there is NaN or infinity in .*learning_rate"):
+        train(DQN_RUN, tmp_path, [Poison(450, value)])
+    folder = tmp_path / "dqn" / "CartPole-v1_1"
+    record = read_record(folder)
+    assert (record["status"], record["num_timesteps"]) == ("diverged", 600)
+    assert record["last_policy"] == 400
+    assert "at step 600" in record["error"]
+    assert "the last policy is that of step 400" in record["error"]
+    assert "results" not in record
+    assert evaluations(folder)[0] == [200, 400]
+    for name in ("CartPole-v1.zip", "best_model.zip"):
+        model = DQN.load(folder / name)
+        assert model.num_timesteps <= 400
+        assert all(bool(th.isfinite(p).all()) for p in model.policy.parameters())
+    assert not (folder / "resume").exists()
+    assert enjoy(folder, episodes=1).episodes == 1
+    with pytest.raises(ConfigError, match=r"has ended: training diverged: at step 600"):
+        resume(folder)
+
+
+def test_a_checkpoint_is_never_of_networks_that_diverged(tmp_path):
+    class After(Poison):  # the evaluation at step 400, before the checkpoint
+        def _on_rollout_end(self) -> None:
+            if self.num_timesteps == 400:
+                self.at = 400
+                self._on_step()
+
+    with pytest.raises(Diverged, match="at step 400"):
+        train(DQN_RUN, tmp_path, [After(-1)])
+    folder = tmp_path / "dqn" / "CartPole-v1_1"
+    assert read_record(folder)["last_policy"] == 200
+    assert evaluations(folder)[0] == [200, 400]
+
+
+def test_networks_that_diverge_after_the_last_evaluation_are_no_finished_run(tmp_path):
+    run = replace(DQN_RUN, n_timesteps=1050)
+    with pytest.raises(Diverged, match="at step 1050"):
+        train(run, tmp_path, [Poison(1020)])
+    assert read_record(tmp_path / "dqn" / "CartPole-v1_1")["last_policy"] == 1000
+
+
+def test_what_sb3_raises_of_networks_that_diverged_is_said_to_be_that(tmp_path):
+    run = replace(PPO_RUN, hyperparams={**PPO_RUN.hyperparams, "learning_rate": 1e30})
+    with pytest.raises(Diverged, match="training diverged: at step") as caught:
+        train(run, tmp_path)
+    assert "no policy was saved before" in str(caught.value)
+    record = read_record(tmp_path / "ppo" / "Pendulum-v1_1")
+    assert (record["status"], record["last_policy"]) == ("diverged", None)
+
+
+def test_an_evaluation_without_a_finite_return_ends_the_run(tmp_path, monkeypatch):
+    monkeypatch.setattr(
+        "stable_baselines3.common.callbacks.evaluate_policy",
+        lambda *args, **kwargs: ([float("nan")], [1]),
+    )
+    with pytest.raises(Diverged, match="the evaluation at step 200 has the return nan"):
+        train(DQN_RUN, tmp_path)
+    assert read_record(tmp_path / "dqn" / "CartPole-v1_1")["status"] == "diverged"
 
 
 def test_a_run_that_failed_says_so_and_can_go_on(tmp_path):

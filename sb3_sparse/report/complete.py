@@ -1,0 +1,55 @@
+"""Whether a run's record has all that figures rely on, and is of what it says."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from sb3_sparse.errors import ConfigError
+from sb3_sparse.zoo.record import DIVERGED, NAME
+
+FINISHED, COUNTED = "finished", "counted"
+NEAR = 0.01  # of the connections; what rounding and schedules differ by is far less
+
+
+def check_complete(record: Mapping[str, Any]) -> None:
+    """Refuse a run that is not over, or a record that lacks a part.
+
+    :raises ConfigError: with the status or the missing part
+    """
+    status = record.get("status")
+    if status == "failed":
+        raise ConfigError(f"failed: {record.get('error') or 'no reason is recorded'}")
+    if status not in (FINISHED, COUNTED, DIVERGED):
+        raise ConfigError(f"not finished: its status is {status!r}")
+    for name in ("run", "settings", "total", "layers", "method"):
+        if not record.get(name):
+            raise ConfigError(f"{NAME} is incomplete: {name!r} is missing")
+    needed = {"run": ("algo", "env_id", "seed"), "total": ("sparsity", "parameters", "flops")}
+    for part, names in needed.items():
+        for name in names:
+            if not isinstance(record[part], dict) or record[part].get(name) is None:
+                raise ConfigError(f"{NAME} is incomplete: {part}.{name} is missing")
+
+
+def check_reached(record: Mapping[str, Any]) -> None:
+    """Refuse a run whose networks are not as sparse as its settings say.
+
+    Runs of before ``wanted_nnz`` was recorded can only have stayed too dense after a denser start.
+
+    :raises ConfigError: with what it reached and what it was to reach
+    """
+    total, kwargs = record["total"], record["settings"].get("policy_kwargs", {})
+    reached, asked = float(total["sparsity"]), kwargs.get("sparsity")
+    wanted = total.get("wanted_nnz")
+    if wanted is not None:
+        missed = abs(int(total["nnz"]) - int(wanted)) > NEAR * int(wanted)
+    else:
+        denser = kwargs.get("initial_sparsity") is not None and isinstance(asked, (int, float))
+        missed = denser and reached < asked - NEAR
+    if missed:
+        raise ConfigError(
+            f"its sparsity is {reached:.2%}, not the {asked} that its settings ask for: it was not "
+            "pruned, or not to the end; train it again with a callback that prunes, longer or with "
+            "a smaller update_interval"
+        )
