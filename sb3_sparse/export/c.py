@@ -30,6 +30,7 @@ from sb3_sparse.export.nodes import (
     PerUnit,
     Positive,
     Slice,
+    Standardize,
     Weighted,
 )
 from sb3_sparse.export.quantize import quantize_rows
@@ -110,6 +111,9 @@ class _Writer:
             self.functions["one_hot"] = ckernels.ONE_HOT
             sizes = self._table("sizes", node.sizes, "uint32_t")
             self.calls.append(f"one_hot({x}, {y}, {len(node.sizes)}, {sizes});")
+        elif isinstance(node, Standardize):
+            self.functions["standardize"] = ckernels.STANDARDIZE
+            self.calls.append(f"standardize({x}, {y}, {_size(node)}, {_number(node.eps)});")
         elif isinstance(node, Concat):
             self.functions["copy_each"] = ckernels.COPY
             start = 0

@@ -142,7 +142,7 @@ static float log1p_exp(float x)
 """,
 }
 """What expressions may call."""
-MATH = ("tanhf", "expm1f", "expf", "erff", "fabsf", "log1pf")
+MATH = ("tanhf", "expm1f", "expf", "erff", "fabsf", "log1pf", "sqrtf")
 """What needs ``math.h``."""
 BORDERED = """\
 static void bordered(const float *x, float *y, uint32_t units, uint32_t height, uint32_t width,
@@ -181,6 +181,21 @@ static void copy_each(const float *x, float *y, uint32_t n)
     uint32_t i;
     for (i = 0; i < n; i++)
         y[i] = x[i];
+}
+"""
+STANDARDIZE = """\
+static void standardize(const float *x, float *y, uint32_t n, float eps)
+{
+    float mean = 0.0f, square = 0.0f;
+    uint32_t i;
+    for (i = 0; i < n; i++)
+        mean += x[i];
+    mean /= (float)n;
+    for (i = 0; i < n; i++)
+        square += (x[i] - mean) * (x[i] - mean);
+    square = sqrtf(square / (float)n + eps);
+    for (i = 0; i < n; i++)
+        y[i] = (x[i] - mean) / square;
 }
 """
 ONE_HOT = """\

@@ -225,6 +225,20 @@ class Concat(Node):
 
 
 @dataclass(frozen=True, eq=False)
+class Standardize(Node):
+    """All units less their mean, by their standard deviation, as layer normalisation does.
+
+    :param eps: added to the variance
+    """
+
+    eps: float
+    op = "standardize"
+
+    def fields(self) -> dict[str, NDArray[Any]]:
+        return {"eps": np.array(self.eps, np.float32)}
+
+
+@dataclass(frozen=True, eq=False)
 class Slice(Node):
     """A part of the observation.
 

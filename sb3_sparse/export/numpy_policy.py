@@ -56,6 +56,7 @@ OPERATIONS = {  # of a node's arrays and its inputs, whose last axis is the batc
     "slice": lambda n, x: x[slice(*n["range"])].reshape(*n["shape"], x.shape[-1]),
     "one_hot": lambda n, x: (np.repeat(x, n["sizes"], 0) == n["values"]).astype(np.float32),
     "concat": lambda n, *x: np.concatenate(x),
+    "standardize": lambda n, x: (x - x.mean(0)) / np.sqrt(x.var(0) + n["eps"]),
     "add": lambda n, x, y: x + y,
     "multiply": lambda n, x, y: x * y,
     "argmax": lambda n, x: np.stack([p.argmax(0) for p in np.split(x, n["splits"])]),

@@ -26,6 +26,7 @@ from sb3_sparse.export.nodes import (
     OneHot,
     Slice,
     Slopes,
+    Standardize,
 )
 from sb3_sparse.export.onnx_activations import write_activation
 
@@ -159,6 +160,9 @@ class _Writer:
             self.node("Flatten", inputs, output)
         elif isinstance(node, (Add, Multiply)):
             self.node("Add" if isinstance(node, Add) else "Mul", inputs, output)
+        elif isinstance(node, Standardize):
+            ones = self.array(np.ones(node.shape))
+            self.node("LayerNormalization", [*inputs, ones], output, epsilon=node.eps)
         elif isinstance(node, Concat):
             self.node("Concat", inputs, output, axis=1)
         elif isinstance(node, Slice):

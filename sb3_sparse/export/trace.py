@@ -26,6 +26,7 @@ from sb3_sparse.export.nodes import (
     Node,
     Normalize,
     Slice,
+    Standardize,
 )
 from sb3_sparse.policies.compiled import unwrapped
 
@@ -39,8 +40,8 @@ DROPOUTS = (nn.Dropout, nn.Dropout1d, nn.Dropout2d, nn.AlphaDropout, nn.FeatureA
 COMPACT = (CompactLinear.forward, ChainedSequential.forward)
 """These compute what torch's do."""
 ALLOWED = (
-    f"Linear, Conv2d, MaxPool2d, Flatten, BatchNorm, Dropout, {NAMES}, and modules whose forward "
-    "does nothing but call these, add, multiply, square, flatten and concatenate"
+    f"Linear, Conv2d, MaxPool2d, Flatten, BatchNorm, LayerNorm, Dropout, {NAMES}, and modules "
+    "whose forward does nothing but call these, add, multiply, square, flatten and concatenate"
 )
 
 
@@ -94,6 +95,8 @@ class Tracer:
             return value
         if _does(module, nn.BatchNorm1d, nn.BatchNorm2d):
             return self._norm(module, "running_mean", "running_var", "weight", value)
+        if _does(module, nn.LayerNorm):
+            return self._layer_norm(module, value)
         if any(cls.__name__ == RENORM for cls in type(module).__mro__):
             return self._norm(module, "ra_mean", "ra_var", "scale", value)
         if _does(module, nn.Sequential):
@@ -200,6 +203,19 @@ class Tracer:
         shape = self.shape_of(value)
         size = _sizes(shape, kernel, stride, padding)
         return self.add(MaxPool((value,), (shape[0], *size), kernel, stride, padding))
+
+    def _layer_norm(self, module: nn.LayerNorm, value: int) -> int:
+        shape = self.shape_of(value)
+        if tuple(module.normalized_shape) != shape or len(shape) > 1:
+            raise self.refusal(
+                module, f"it takes a value of shape {shape}", "vectors, normalised as a whole"
+            )
+        value = self.add(Standardize((value,), shape, float(module.eps)))
+        if not module.elementwise_affine:
+            return value
+        scale = _array(module.weight)
+        shift = np.zeros_like(scale) if module.bias is None else _array(module.bias)
+        return self.add(Affine((value,), shape, scale, shift))
 
     def _norm(self, module: Any, mean: str, var: str, weight: str, value: int) -> int:
         """Batch normalisation as it is in evaluation: by its running statistics."""

@@ -23,6 +23,7 @@ from sb3_sparse.export.nodes import (
     Node,
     Normalize,
     PerUnit,
+    Standardize,
     Weighted,
 )
 
@@ -116,7 +117,7 @@ class _Constants:
                 self.source[value] = self.source[node.inputs[0]]
             if isinstance(node, Weighted):
                 self.known[value] = self._of_layer(node)
-            elif isinstance(node, (Add, Multiply, Concat)):
+            elif isinstance(node, (Add, Multiply, Concat, Standardize)):
                 for operand in node.inputs:
                     self.pinned[self.source[operand]][:] = True
                 self.pinned[value][:] = True

@@ -17,6 +17,7 @@ from sb3_sparse.export.activations import FORMULAS
 from sb3_sparse.export.artifact import c_artifact, numpy_artifact, onnx_artifact
 from sb3_sparse.export.fold import fold
 from sb3_sparse.export.graph import Graph
+from sb3_sparse.export.nodes import Standardize
 from sb3_sparse.export.trace import Tracer
 
 UNITS = 6
@@ -153,6 +154,34 @@ def test_activations_of_ones_own(activation, to, tmp_path):
     assert export(model, tmp_path / "policy", to).parity.holds
 
 
+class Normed(OwnExtractor):
+    """Layer normalisation as it is used before and behind an activation."""
+
+    def __init__(self, observation_space):
+        super().__init__(observation_space)
+        self.first = nn.Sequential(
+            nn.Linear(5, 16), nn.LayerNorm(16), nn.Mish(), nn.LayerNorm(16, bias=False)
+        )
+        self.second = nn.LayerNorm(16, elementwise_affine=False)
+
+
+@pytest.mark.parametrize("to", ["c", "numpy", "onnx"])
+def test_layer_normalisation(to, tmp_path):
+    kwargs = dict(features_extractor_class=Normed, sparsity=0.6)
+    model = make("SAC", Task(VECTOR, spaces.Box(-1, 1, (2,))), policy_kwargs=kwargs)
+    for module in model.policy.modules():
+        if isinstance(module, nn.LayerNorm):
+            for parameter in module.parameters():
+                parameter.data.uniform_(-1, 2)
+    assert export(model, tmp_path / "policy", to).parity.holds
+
+
+def test_a_layer_is_standardised_by_hand():
+    # Mean 3, variance (4 + 0 + 4) / 3.
+    graph = Graph((3,), (Standardize((0,), (3,), 1 / 3),), (3,))
+    np.testing.assert_allclose(graph.run([[1, 3, 5]]), [[-2 / 3**0.5, 0, 2 / 3**0.5]], rtol=1e-6)
+
+
 class Residual(nn.Sequential):
     def forward(self, x):
         return x + super().forward(x)
@@ -186,10 +215,10 @@ class WithNoisy(OwnExtractor):
         self.second = Noisy(16, 16)
 
 
-class Normed(OwnExtractor):
+class Grouped(OwnExtractor):
     def __init__(self, observation_space):
         super().__init__(observation_space)
-        self.second = nn.LayerNorm(16)
+        self.second = nn.GroupNorm(2, 16)
 
 
 class Sine(OwnExtractor):
@@ -211,7 +240,7 @@ class AlwaysDropped(OwnExtractor):
     ("extractor", "message"),
     [
         (WithNoisy, r"features_extractor.second \(Noisy\) cannot be exported: .*; allowed are Lin"),
-        (Normed, r"features_extractor.second \(LayerNorm\) cannot be exported; allowed are Linear"),
+        (Grouped, r"features_extractor.second \(GroupNorm\) cannot be exported; allowed are Lin"),
         (Sine, r"features_extractor \(Sine\) .*: its forward calls sin\(\); allowed"),
         (Twice, r"features_extractor \(Twice\) .*: its forward calls view\(-1, 32\); allowed"),
         (AlwaysDropped, r"features_extractor \(AlwaysDropped\) .* calls dropout\("),
