@@ -11,6 +11,8 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.utils import ConstantSchedule
 
+from sb3_sparse.loading.zips import check_finite
+
 EXPERIENCE = 10_000
 """Environment steps that a replay buffer shall hold before it is learnt from."""
 HALF_WAY = 0.5
@@ -47,6 +49,7 @@ def fine_tune(model: BaseAlgorithm, steps: int) -> None:
 
     :param model: a sparse model with an environment
     :param steps: environment steps
+    :raises Diverged: if the network is not finite afterwards
     """
     planned = model.num_timesteps + steps
     lag = model.n_steps * model.n_envs if isinstance(model, OnPolicyAlgorithm) else 0
@@ -57,7 +60,10 @@ def fine_tune(model: BaseAlgorithm, steps: int) -> None:
         if callable(schedule := getattr(model, name, None)):
             changes[name] = ConstantSchedule(schedule(HALF_WAY))
     with _changed(model, **changes, **_settled(model)):
-        model.learn(steps, reset_num_timesteps=False)
+        try:
+            model.learn(steps, reset_num_timesteps=False)
+        finally:  # a distribution of NaN raises an error of torch's, which says less
+            check_finite(model.policy.state_dict(), "the model that is fine-tuned")
 
 
 def fill_buffer(model: BaseAlgorithm) -> int:

@@ -15,6 +15,7 @@ from sb3_sparse.errors import ConfigError, CorruptStateError
 from sb3_sparse.loading.guard import reading
 from sb3_sparse.loading.zips import check_state, look_into, read_model
 from sb3_sparse.policies.saving import differ
+from sb3_sparse.zoo.arguments import Kind, is_whole, kind_of
 from sb3_sparse.zoo.environments import package_names
 from sb3_sparse.zoo.experiment import load_for_prediction, loadable_algorithms, quiet
 from sb3_sparse.zoo.folder import (
@@ -43,6 +44,8 @@ BY_POLICY = {
 FOREIGN = ("Recurrent", "Maskable")
 """Policies that inherit from PPO's and are of other algorithms."""
 ON_POLICY = ("ppo", "a2c", "trpo")
+COUNTED = ("num_timesteps", "_total_timesteps", "_num_timesteps_at_start", "_n_updates")
+COUNTERS = Kind("a whole number, 0 or more", lambda v: is_whole(v) and v >= 0)
 
 
 @dataclass(frozen=True)
@@ -82,6 +85,7 @@ class Saved:
         if env is not None:
             data, _ = read_model(self.path)
             self.check_suits(env, data.get("observation_space"), data.get("action_space"))
+            check_attributes(self.path, self.algo, data)
         with reading(
             self.path,
             f"model of {self.algo}",
@@ -108,6 +112,24 @@ class Saved:
                 f"{self.path} does not suit {self.env_id}: {error}; give the environment that it "
                 "was trained in, and a run's folder where it wraps or stacks observations"
             ) from error
+
+
+def check_attributes(path: Path, algo: str, data: Mapping[str, Any]) -> None:
+    """Refuse a model with a setting that it cannot train on with.
+
+    :param path: of its zip
+    :param algo: algorithm, e.g. ``"sac"``
+    :param data: the model's attributes; those that are no plain values are not looked at
+    :raises CorruptStateError: if so
+    """
+    for name, value in data.items():
+        kind = COUNTERS if name in COUNTED else kind_of(algo, name)
+        plain = value is None or isinstance(value, (bool, int, float, str, list, dict))
+        if kind is not None and plain and not kind.fits(value):
+            raise CorruptStateError(
+                f"{path} cannot be trained on with: {name} must be {kind.allowed}, got {value!r}. "
+                "Load it, set that, and save it again; or take an earlier one"
+            )
 
 
 def find_saved(

@@ -187,6 +187,9 @@ def test_wrong_types_are_one_line_that_names_the_file(name, change, commands, fo
         (changed_zip(policy_kwargs={"net_arch": "wide"}), ("enjoy", "export", "compress")),
         (changed_zip(batch_size="many"), ("inspect",)),
         (changed_zip(n_envs=None), ("compress",)),
+        (changed_zip(gamma=5.0), ("compress",)),
+        (changed_zip(max_grad_norm={"a": 1}), ("compress",)),
+        (changed_zip(num_timesteps="many"), ("compress",)),
     ],
 )
 def test_wrong_members_of_a_zip_are_one_line_that_names_it(change, commands, folder, said):
