@@ -29,7 +29,7 @@ def read_arrays(
         if not isinstance(content, np.lib.npyio.NpzFile):
             raise CorruptStateError(f"{path} is damaged, or is no {what}: no archive; {cure}")
         with content:
-            arrays = {name: content[name] for name in content.files}
+            arrays = {name: np.asanyarray(content[name]) for name in content.files}
     for name in needed:
         if name not in arrays:
             raise CorruptStateError(f"{path} is damaged: {name} is missing; {cure}")

@@ -16,6 +16,7 @@ from sb3_sparse.errors import CorruptStateError
 from sb3_sparse.loading.arrays import read_arrays
 from sb3_sparse.loading.guard import reading
 from sb3_sparse.loading.text import read_json
+from sb3_sparse.loading.zips import read_model
 from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.policies.mixin import SparsePolicyMixin
 from sb3_sparse.zoo.divergence import check_networks, check_return
@@ -63,11 +64,13 @@ class Evaluated:
                 damaged = file.testzip()
             if damaged is not None:
                 raise CorruptStateError(f"{path} is damaged: the checksum of {damaged}; {CURE}")
+            read_model(path)
         if count == 0:
             return cls(best)
         needed, path = ("timesteps", "results", "ep_lengths"), folder / NPZ
         saved = read_arrays(path, what, CURE, needed)
-        if any(array.shape[:1] != (count,) for array in saved.values()):
+        steps, *episodes = (saved[name].shape for name in needed)
+        if steps != (count,) or any(one[:1] != steps or len(one) != 2 for one in episodes):
             raise CorruptStateError(f"{path} is damaged: it has not {count} evaluations; {CURE}")
         names = (*needed, "successes")
         return cls(best, *(saved[name].tolist() for name in names if name in saved))

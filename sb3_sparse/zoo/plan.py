@@ -10,11 +10,13 @@ from typing import Any
 from sb3_sparse.errors import CorruptStateError
 from sb3_sparse.loading.guard import reading
 from sb3_sparse.loading.statistics import read_statistics
-from sb3_sparse.loading.zips import check_state, look_into
+from sb3_sparse.loading.zips import read_model
 from sb3_sparse.zoo.arguments import is_whole
 from sb3_sparse.zoo.folder import VECNORMALIZE, params_of
 from sb3_sparse.zoo.record import CURE, NAME, WHAT
 from sb3_sparse.zoo.run import Run
+from sb3_sparse.zoo.saved import Saved, check_attributes
+from sb3_sparse.zoo.validation import check_settings
 
 
 @dataclass(frozen=True)
@@ -52,20 +54,25 @@ def planned(folder: Path, record: Mapping[str, Any]) -> Plan:
                 raise CorruptStateError(
                     f"{path} is damaged: {name} is {evaluation[name]!r}; {CURE}"
                 )
-        return Plan(Run(**record["run"]), settings, evaluation, str(record["tensorboard_log"]))
+        run = Run(**record["run"])
+        check_settings(settings, run.algorithm)
+        if "n_timesteps" not in settings:
+            raise CorruptStateError(f"{path} is damaged: its settings lack n_timesteps; {CURE}")
+        return Plan(run, settings, evaluation, str(record["tensorboard_log"]))
 
 
-def check_start(start: Path, env_id: str) -> None:
+def check_start(start: Path, run: Run) -> None:
     """Refuse a model or statistics that training cannot go on from.
 
     :param start: folder of a checkpoint, or of the run
-    :param env_id: what the run is trained in
+    :param run: what is trained
     :raises ConfigError: if there is no model
     :raises CorruptStateError: if one of the two files is damaged
     :raises Diverged: if one of them is not finite
     """
-    params = params_of(start, env_id)
-    path = params.with_name(f"{params.name}.zip")
-    check_state(look_into(path).state, str(path))
+    params = params_of(start, run.env_id)
+    saved = Saved(params.with_name(f"{params.name}.zip"), run.algo)
+    saved.load()
+    check_attributes(saved.path, run.algo, read_model(saved.path)[0])
     if (params / VECNORMALIZE).is_file():
         read_statistics(params / VECNORMALIZE)

@@ -6,6 +6,7 @@ import os
 import pickle
 import shutil
 from collections.abc import Callable, Iterator
+from numbers import Integral
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_sparse.errors import ConfigError
+from sb3_sparse.loading.arrays import read_arrays
 
 ROWS = 10_000  # of one file
 LARGE = ("observations", "next_observations")  # written once and never changed; all else is small
@@ -81,8 +83,8 @@ def restore_buffer(buffer: BaseBuffer, folder: Path) -> None:
     """
     rest = _read(folder, REST, _unpickled)
     for name in ("pos", "full", "buffer_size"):
-        if name not in rest:
-            raise _lacking(folder, REST, f"has no {name!r}")
+        if not isinstance(rest.get(name), Integral):
+            raise _lacking(folder, REST, f"has no {name!r}, or of another type")
     if rest["buffer_size"] != buffer.buffer_size:
         raise _lacking(folder, REST, f"is of {rest['buffer_size']} rows, not {buffer.buffer_size}")
     filled = _filled(rest["pos"], rest["full"], buffer.buffer_size)
@@ -120,8 +122,7 @@ def _unpickled(path: Path) -> dict[str, Any]:
 
 
 def _arrays(path: Path) -> dict[str, Any]:
-    with np.load(path) as saved:
-        return dict(saved)
+    return dict(read_arrays(path, "part of a replay buffer", "restore it"))
 
 
 def _lacking(folder: Path, name: str, what: str) -> ConfigError:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -130,6 +131,12 @@ def check_attributes(path: Path, algo: str, data: Mapping[str, Any]) -> None:
                 f"{path} cannot be trained on with: {name} must be {kind.allowed}, got {value!r}. "
                 "Load it, set that, and save it again; or take an earlier one"
             )
+    episodes = {type(data.get(name)) for name in ("ep_info_buffer", "ep_success_buffer")}
+    if episodes not in ({deque}, {type(None)}):
+        raise CorruptStateError(
+            f"{path} is damaged: a buffer of episodes is missing or of another type; take an "
+            "earlier one"
+        )
 
 
 def find_saved(

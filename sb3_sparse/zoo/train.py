@@ -126,7 +126,7 @@ def resume(folder: Path, callbacks: Sequence[BaseCallback] = ()) -> Outcome:
             observation_space, _ = spaces_of(run, settings, folder, evaluation)
             use_few_threads(observation_space)
             if start is not None:
-                check_start(start, run.env_id)
+                check_start(start, run)
             if start != folder:
                 if start is not None:
                     Evaluated.read(start)  # all is read before anything is replaced
