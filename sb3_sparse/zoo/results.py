@@ -14,6 +14,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
+from sb3_sparse.loading.guard import reading
 from sb3_sparse.zoo.divergence import check_return
 from sb3_sparse.zoo.run import Run
 
@@ -80,7 +81,8 @@ def final_results(
     best = path.with_name("best_model.zip")
     if best.is_file():
         last: Any = deepcopy(model.get_parameters())
-        model.set_parameters(str(best))
+        with reading(best, "best model of this run", "remove it, and resume the run"):
+            model.set_parameters(str(best))
         results.append(_evaluate("Best policy", run, model, best, envs, deterministic))
         model.set_parameters(last)
     return tuple(results)

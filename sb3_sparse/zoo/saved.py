@@ -45,7 +45,13 @@ BY_POLICY = {
 FOREIGN = ("Recurrent", "Maskable")
 """Policies that inherit from PPO's and are of other algorithms."""
 ON_POLICY = ("ppo", "a2c", "trpo")
-COUNTED = ("num_timesteps", "_total_timesteps", "_num_timesteps_at_start", "_n_updates")
+COUNTED = (
+    "num_timesteps",
+    "_total_timesteps",
+    "_num_timesteps_at_start",
+    "_n_updates",
+    "_episode_num",
+)
 COUNTERS = Kind("a whole number, 0 or more", lambda v: is_whole(v) and v >= 0)
 
 
