@@ -12,6 +12,12 @@ th.set_num_threads(1)
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+@pytest.fixture(autouse=True)
+def distributions_check_their_arguments(monkeypatch):
+    """As by default: torch.compile, which some tests use, turns it off for the whole process."""
+    monkeypatch.setattr(th.distributions.Distribution, "_validate_args", True)
+
+
 @pytest.fixture
 def mistake(tmp_path, monkeypatch, capsys):
     """Runs a command that must end with an error of the user's, and gives its one line."""

@@ -44,7 +44,7 @@ def raw_gradients(model) -> dict[str, list[np.ndarray]]:
             seen.setdefault(name, []).append(grad.detach().numpy().ravel().copy())
 
         layer.weight.register_hook(note)
-    model.policy.sparse._hooked = []  # ours come after those above
+    model.policy.sparse._gradient_hooks.remove()  # ours come after those above
     model.policy.sparse.attach()
     return seen
 

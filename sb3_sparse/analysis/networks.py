@@ -13,12 +13,12 @@ from torch import nn
 
 from sb3_sparse.engine.controller import Controller
 from sb3_sparse.engine.kernels import KERNEL_TYPES, UNSUPPORTED_TYPES, Kernel
-from sb3_sparse.engine.linear import CompactLinear
-from sb3_sparse.engine.sequential import ChainedSequential
+from sb3_sparse.engine.plain import make_plain
 from sb3_sparse.errors import UnsupportedError
 from sb3_sparse.policies.aliases import supported_algorithms
 from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.policies.mixin import SparsePolicyMixin
+from sb3_sparse.policies.parts import without_graphs
 from sb3_sparse.policies.spec import NetworkSpec
 
 
@@ -114,23 +114,15 @@ def dense_twin(policy: BasePolicy) -> BasePolicy:
     parameter name, so that gradients at inactive connections can be taken.
     """
     policy = unwrapped(policy)
-    memo: dict[int, Any] = {}
+    memo = without_graphs(policy)
     for module in policy.modules():
-        for name, value in vars(module).items():
+        for value in vars(module).values():
             if isinstance(value, (th.optim.Optimizer, Controller)):
                 memo[id(value)] = _LeftOut()
-            elif name == "action_dist":  # its last distribution hangs on a graph
-                memo[id(value)] = copy.copy(value)
     twin = type(policy).__new__(type(policy))
     memo[id(policy)] = twin
     twin.__dict__.update(copy.deepcopy(policy.__dict__, memo))
-    for module in twin.modules():
-        if isinstance(module, ChainedSequential):
-            module.__class__ = nn.Sequential  # type: ignore[assignment]
-        elif isinstance(module, CompactLinear):
-            dense = module.dense()
-            module.__class__ = nn.Linear  # type: ignore[assignment]
-            module.weight = nn.Parameter(dense)
+    make_plain(twin)
     for parameter in twin.parameters():
         parameter.requires_grad_(False)
     return twin.train(False)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from typing import Any
 
@@ -13,9 +13,10 @@ from torch import nn
 
 from sb3_sparse.engine.gradients import DenseGradient, GradientMask, weakly
 from sb3_sparse.engine.layers import SparseLayer, moments_of
-from sb3_sparse.engine.linear import NO_WEIGHT, CompactLinear
+from sb3_sparse.engine.linear import CompactLinear
 from sb3_sparse.engine.masked import MaskedLayer
 from sb3_sparse.engine.structure import Structure
+from sb3_sparse.errors import UnsupportedError
 
 
 class CompactLayer(SparseLayer):
@@ -41,6 +42,7 @@ class CompactLayer(SparseLayer):
         for target in layer.targets:
             assert isinstance(target, nn.Linear)
             self._targets.append(CompactLinear.convert(target, structure, is_target=True))
+            target.register_load_state_dict_post_hook(self._after_target_load)  # type: ignore[no-untyped-call]
         self.module.register_load_state_dict_post_hook(self._after_load)  # type: ignore[no-untyped-call]
         self.settle_moments(optimizers)
 
@@ -61,13 +63,23 @@ class CompactLayer(SparseLayer):
 
     def mask_targets(self) -> None:
         for target in self._targets:
-            dense = target.dense().view(-1)
-            if dense.max() > NO_WEIGHT:  # parameters of a target that awaited its copy elsewhere
-                dense = self.module.dense().view(-1)
-            target.restructure(self.module.structure, dense[self._flat()])
+            target.take(self.module.structure, target.dense())
 
     def remask(self) -> None:
         """There is nothing inactive to set to 0."""
+
+    def mask_gradient(self) -> None:
+        """There is none of what is inactive."""
+
+    def write(self, dense: th.Tensor) -> None:
+        self.module.take(self.module.structure, dense)
+
+    def settle_targets(self, soft: bool) -> None:
+        if any(target.snapshot is not None for target in self._targets):  # else they fit already
+            super().settle_targets(soft)
+
+    def _dense_targets(self) -> Iterable[NDArray[np.float32]]:
+        return (target.dense().numpy() for target in self._targets)
 
     def gradient_mask(self, functional: bool, capturing: Callable[[], bool]) -> GradientMask:
         return CompactGradient(self, functional, capturing)
@@ -82,6 +94,27 @@ class CompactLayer(SparseLayer):
                 state[key] = places(value)
         self._structure = structure
         self.moments_stale = False
+
+    @property
+    def connections(self) -> object:
+        return self.module.structure
+
+    def follow(self, optimizer: th.optim.Optimizer, since: object) -> None:
+        structure = self.module.structure
+        for state, key, value in moments_of([optimizer], self.weight):
+            if tuple(value.shape) == self.shape:
+                state[key] = value.reshape(-1)[self._flat()]
+            elif since is structure:
+                return
+            elif isinstance(since, Structure) and value.shape == (since.nnz,):
+                state[key] = _carried(structure, since)(value)
+            else:
+                raise UnsupportedError(
+                    f"the connections of {self.name} have moved, and {type(optimizer).__name__} "
+                    f"remembers {key!r} of shape {tuple(value.shape)}, which cannot follow them; "
+                    "make a new optimizer after the mask has moved, or the policy with "
+                    "compute='masked'"
+                )
 
     def saved_moment(self, moment: th.Tensor) -> th.Tensor:
         if moment.shape != (self._structure.nnz,):
@@ -110,7 +143,7 @@ class CompactLayer(SparseLayer):
             grad = _followed(grad, dense_grad, before, after, carried)
         for target in self._targets:
             if soft_targets:
-                target.restructure(after, carried(target.weight.detach()))
+                target.take(after, target.dense())
             else:
                 target.await_copy(after)
         self.module.restructure(after, carried(self.weight.detach()))
@@ -125,11 +158,8 @@ class CompactLayer(SparseLayer):
         structure = self.module.structure
         self.nnz = structure.nnz
         self.moments_stale = True
-        for target in self._targets:
-            if target.structure is not structure:
-                dense = target.dense()
-                target.structure = structure
-                target._take(dense)
+        if any(target.structure is not structure for target in self._targets):
+            self.mask_targets()
 
 
 class CompactGradient(GradientMask):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Container, Iterable
 from functools import partial
 from typing import Any
@@ -12,12 +13,19 @@ from torch.utils.hooks import RemovableHandle
 
 from sb3_sparse.engine.auto import AutoCompute, Choice
 from sb3_sparse.engine.compact import compacted
+from sb3_sparse.engine.foreign import watch
 from sb3_sparse.engine.gradients import GradientMask
+from sb3_sparse.engine.hooks import Hooks
 from sb3_sparse.engine.layers import SparseLayer
 from sb3_sparse.engine.network import SparseNetwork
-from sb3_sparse.engine.optimizers import add_weight_decay, keep_implementation
+from sb3_sparse.engine.optimizers import (
+    acts_elementwise,
+    add_weight_decay,
+    keep_implementation,
+)
 from sb3_sparse.engine.plan import Plan
 from sb3_sparse.engine.sequential import chain_up
+from sb3_sparse.errors import UnsupportedError
 
 
 class Controller:
@@ -55,18 +63,17 @@ class Controller:
         self.progress = 0.0
         self.updates_due = 0
         """Updates that have come due since the plan was made, of all networks together."""
-        self.soft_targets = True
-        self._handles: list[RemovableHandle] = []
-        self._hooked: list[object] = []
+        self.soft_targets = False
+        """Whether targets follow a mask at once; as long as nobody says so, they need not."""
         self._gradient_masks: dict[str, GradientMask] = {}
+        self._gradient_hooks, self._optimizer_hooks = Hooks(), Hooks()
+        self._warned = False
 
     def __getstate__(self) -> dict[str, Any]:
         return {
             **self.__dict__,
             "plan": None,
             "_in_force": bool,
-            "_handles": [],
-            "_hooked": [],
             "_gradient_masks": {},
         }
 
@@ -92,35 +99,61 @@ class Controller:
 
     def attach(self) -> None:
         """Register the hooks, unless they already are on these very weights and optimizers."""
-        hooked = [*(layer.weight for layer in self.layers), *self.optimizers]
-        if len(hooked) == len(self._hooked) and all(
-            a is b for a, b in zip(hooked, self._hooked, strict=True)
-        ):
-            return
-        for handle in self._handles:
-            handle.remove()
+        changed = self._attach_to_gradients()
+        if self._optimizer_hooks.attach(self.optimizers, self._hook_optimizers) or changed:
+            watch(self)
+
+    def _attach_to_gradients(self) -> bool:
+        """Register the hooks on gradients alone; whether they were missing."""
+        weights = [layer.weight for layer in self.layers if not layer.frozen]
+        return self._gradient_hooks.attach(weights, self._hook_gradients)
+
+    def _hook_gradients(self) -> list[RemovableHandle]:
         self._gradient_masks = {
             layer.name: layer.gradient_mask(
                 self.functional_gradients, partial(self._capturing, network)
             )
             for network in self.networks
             for layer in network.layers
+            if not layer.frozen
         }
-        self._handles = [mask.attach() for mask in self._gradient_masks.values()]
+        return [mask.attach() for mask in self._gradient_masks.values()]
+
+    def _hook_optimizers(self) -> list[RemovableHandle]:
+        handles: list[RemovableHandle] = []
         for optimizer in self.optimizers:
-            self._handles += [
+            handles += [
                 optimizer.register_step_pre_hook(self._before_step),
                 optimizer.register_load_state_dict_pre_hook(keep_implementation),
                 optimizer.register_load_state_dict_post_hook(self._after_load),
                 optimizer.register_state_dict_post_hook(self._saved_form),
             ]
-        self._hooked = list(hooked)
+            if not acts_elementwise(optimizer):
+                self._check_masked(optimizer)
+                handles.append(optimizer.register_step_post_hook(self._after_step))
+        return handles
+
+    def _check_masked(self, optimizer: th.optim.Optimizer) -> None:
+        compact = [
+            layer.name
+            for network in self.networks
+            if network.optimizer is optimizer
+            for layer in network.layers
+            if layer.compact
+        ]
+        if compact:
+            raise UnsupportedError(
+                f"{type(optimizer).__name__} does not move each weight by itself, as Adam does, so "
+                f"it cannot move layers that store active connections only ({compact[0]}); make "
+                "the policy with compute='masked', or use another optimizer_class"
+            )
 
     def compact(self, root: nn.Module, names: Container[str] | None = None) -> None:
         """Store linear layers as their active connections from now on; they stay in place.
 
         :param root: the policy, whose ``Sequential`` modules shall run them as chains
         :param names: which; None: all
+        :raises UnsupportedError: if their optimizer needs matrices
         """
         for network in self.networks:
             network.layers = [
@@ -128,7 +161,8 @@ class Controller:
                 for layer in network.layers
             ]
         chain_up(root)
-        self._hooked = []
+        self._gradient_hooks.remove()
+        self._optimizer_hooks.remove()
         self.attach()
 
     def begin_training(self, root: nn.Module) -> None:
@@ -147,6 +181,32 @@ class Controller:
             self.plan = None  # of a training that was interrupted
         for mask in self._gradient_masks.values():
             mask.dense_grad = None
+        self.enforce()
+        for layer in self.layers:
+            layer.settle_targets(self.soft_targets)
+
+    def enforce(self) -> None:
+        """Set to 0 what masks have inactive, whoever wrote it."""
+        for layer in self.layers:
+            layer.remask()
+
+    def check_places(self, root: nn.Module) -> None:
+        """Refuse a policy in which a sparse layer was replaced by another module.
+
+        :param root: the policy
+        :raises UnsupportedError: if one was
+        """
+        for layer in self.layers:
+            module: nn.Module | None = root
+            for name in layer.name.split("."):
+                module = None if module is None else module._modules.get(name)
+            if module is not layer.module:
+                raise UnsupportedError(
+                    f"{layer.name} was replaced after the policy had been made, so the new module "
+                    "is neither sparse nor counted; copy new weights into the layer that is there "
+                    "(load_state_dict, copy_), or make a policy that has the new layer from the "
+                    "beginning (net_arch, features_extractor_class or a subclass)"
+                )
 
     def start(self, plan: Plan, soft_targets: bool, in_force: Callable[[], bool]) -> None:
         """Let masks move from now on.
@@ -191,19 +251,40 @@ class Controller:
         )
 
     def _before_step(self, optimizer: th.optim.Optimizer, args: object, kwargs: object) -> None:
+        if self._attach_to_gradients():  # a layer was frozen until now
+            for layer in self.layers:
+                layer.mask_gradient()
         for network in self.networks:
             if network.optimizer is not optimizer:
                 continue
             network.clock += 1
+            if network.denser and self.plan is None:
+                self._warn_of_no_plan()
             for layer in network.layers:
                 if layer.moments_stale:  # a shared extractor may have moments in several
                     layer.settle_moments(self.optimizers)
-                if self.functional_gradients and layer.weight.grad is None:
-                    layer.remask()  # TRPO wrote it, from a direction that begins with noise
             if self.plan is not None:
                 self._update_if_due(network, self.plan)
             if self.weight_decay:
                 add_weight_decay(network.kernels, self.weight_decay)
+
+    def _after_step(self, optimizer: th.optim.Optimizer, args: object, kwargs: object) -> None:
+        """Of optimizers that write to what is inactive."""
+        for network in self.networks:
+            if network.optimizer is optimizer:
+                for layer in network.layers:
+                    layer.remask()
+
+    def _warn_of_no_plan(self) -> None:
+        if self._warned:
+            return
+        self._warned = True
+        warnings.warn(
+            f"the policy trains at sparsity {self.sparsity:.3g}, denser than was asked for, and "
+            "nothing takes it further: pass SparsityCallback('prune') to learn(), or leave "
+            "initial_sparsity out to begin at the sparsity asked for",
+            stacklevel=2,
+        )
 
     def _update_if_due(self, network: SparseNetwork, plan: Plan) -> None:
         gradients = network.take_gradients(self._gradient_masks)
@@ -238,6 +319,8 @@ class Controller:
         nnz = network.nnz
         dropped = grown = 0
         for layer in network.layers:
+            if layer.frozen:
+                continue
             gradient = gradients.get(layer.name)
             dense_grad = None
             if plan.topology.needs_gradient:

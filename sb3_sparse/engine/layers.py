@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -49,6 +49,11 @@ class SparseLayer(ABC):
         return self.nnz == self.size
 
     @property
+    def frozen(self) -> bool:
+        """Whether the weight is not trained, so that its connections stay where they are."""
+        return not self.weight.requires_grad
+
+    @property
     @abstractmethod
     def targets(self) -> Sequence[Kernel]:
         """Target copies of the layer."""
@@ -75,6 +80,34 @@ class SparseLayer(ABC):
         """Set to 0 what the mask has inactive, after somebody wrote the weight."""
 
     @abstractmethod
+    def mask_gradient(self) -> None:
+        """Set to 0 what the mask has inactive in a gradient that came while no hook was on it."""
+
+    @abstractmethod
+    def write(self, dense: th.Tensor) -> None:
+        """Replace the active weights; what is inactive stays 0.
+
+        :param dense: as many elements as the dense weight
+        """
+
+    def settle_targets(self, soft: bool) -> None:
+        """Bring the targets in line with the mask.
+
+        :param soft: whether they follow it at once. A hard target may keep the connections that it
+            had at its last copy, but never more than the layer had at any time.
+        """
+        most = max(self.nnz, self.initial_nnz)
+        if soft or any(np.count_nonzero(dense) > most for dense in self._dense_targets()):
+            self.mask_targets()
+
+    @abstractmethod
+    def _dense_targets(self) -> Iterable[NDArray[np.float32]]:
+        """The dense weights of each target."""
+
+    def _after_target_load(self, module: nn.Module, incompatible_keys: object) -> None:
+        self.settle_targets(soft=False)
+
+    @abstractmethod
     def gradient_mask(self, functional: bool, capturing: Callable[[], bool]) -> GradientMask:
         """What keeps gradients true to the mask.
 
@@ -85,6 +118,19 @@ class SparseLayer(ABC):
     @abstractmethod
     def settle_moments(self, optimizers: Sequence[th.optim.Optimizer]) -> None:
         """Bring what optimizers remember in line with mask and storage."""
+
+    @property
+    @abstractmethod
+    def connections(self) -> object:
+        """Another object each time the mask or its storage has changed."""
+
+    @abstractmethod
+    def follow(self, optimizer: th.optim.Optimizer, since: object) -> None:
+        """Bring what an optimizer of the user's own remembers in line with mask and storage.
+
+        :param since: :attr:`connections` when it last did
+        :raises UnsupportedError: if what it remembers cannot follow a mask that has moved
+        """
 
     @abstractmethod
     def saved_moment(self, moment: th.Tensor) -> th.Tensor:

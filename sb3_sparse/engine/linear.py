@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import torch as th
 from torch import nn
@@ -13,10 +13,6 @@ from sb3_sparse.engine.structure import Structure
 from sb3_sparse.errors import CorruptStateError, UnsupportedError
 
 MASK_KEY = "weight_mask"
-AWAITING = float(th.finfo(th.float32).max)
-"""Value of a hard target's weights from a move of the mask to the next copy."""
-NO_WEIGHT = 1e30
-"""What is above is no weight but that value, perhaps scaled by somebody."""
 
 
 class Listener(Protocol):
@@ -27,6 +23,20 @@ class Listener(Protocol):
 
     def note(self, dense_grad: Callable[[], th.Tensor]) -> None:
         """Take what computes it, in the weight's dense shape, from saved activations."""
+
+
+class Snapshot(NamedTuple):
+    """What a hard target computes with from a move of its mask to the next copy.
+
+    :param structure: the connections that it had before the move
+    :param values: their weights, shape ``(structure.nnz,)``
+    :param placed: what its Parameter has held since the move: ``values`` where the new mask has
+        them, else 0. As soon as the Parameter holds anything else, somebody has written it.
+    """
+
+    structure: Structure
+    values: th.Tensor
+    placed: th.Tensor
 
 
 class CompactLinear(nn.Linear):
@@ -40,8 +50,8 @@ class CompactLinear(nn.Linear):
 
     weight: nn.Parameter
     structure: Structure
-    snapshot: tuple[Structure, th.Tensor] | None
-    """What a hard target computes with until its next copy, if the mask moved since the last."""
+    snapshot: Snapshot | None
+    """What a hard target computes with if the mask has moved since the last copy."""
     is_target: bool
     listener: Listener | None
 
@@ -56,7 +66,7 @@ class CompactLinear(nn.Linear):
         module.is_target = is_target
         module.listener = None
         module.weight.grad = None
-        module._take(dense)
+        module.take_saved(dense)
         return module
 
     def __getstate__(self) -> dict[str, Any]:
@@ -71,12 +81,34 @@ class CompactLinear(nn.Linear):
         check_conversion(fn)
         return super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
 
+    def apply(self, fn: Callable[[nn.Module], Any]) -> CompactLinear:
+        """As in torch: ``fn`` may draw the weight anew and sees it dense, shape ``(out, in)``.
+
+        What it writes to an inactive connection is dropped.
+        """
+        dense, grad = self.dense(), self.weight.grad
+        replace_data(self.weight, dense)
+        try:
+            fn(self)
+            dense = self.weight.detach().clone()
+        finally:
+            self.take_saved(dense)
+            self.weight.grad = grad
+        return self
+
+    def reset_parameters(self) -> None:
+        """Draw weights and biases as ``nn.Linear`` does; what is inactive stays absent."""
+        if self.weight.dim() == 2:  # within :meth:`apply`, or while torch builds the layer
+            super().reset_parameters()
+        else:
+            self.apply(nn.Linear.reset_parameters)
+
     def live(self) -> tuple[Structure, th.Tensor]:
         """The connections to compute with now, and their values."""
         if self.snapshot is not None:
-            if self.weight.detach()[0].item() > NO_WEIGHT:
-                return self.snapshot
-            self.snapshot = None  # the online network has been copied since
+            if th.equal(self.weight.detach(), self.snapshot.placed):
+                return self.snapshot.structure, self.snapshot.values
+            self.snapshot = None  # the online network has been copied or blended in since
         return self.structure, self.weight
 
     def dense(self) -> th.Tensor:
@@ -96,26 +128,32 @@ class CompactLinear(nn.Linear):
         replace_data(self.weight, values)
 
     def await_copy(self, structure: Structure) -> None:
-        """Of a hard target: compute with what is there until the online weights are copied.
+        """Compute with what is there until somebody writes the weights (for hard targets).
 
         :param structure: connections of the online layer from now on
         """
-        current, values = self.live()
-        self.snapshot = (current, values.detach().clone())
-        self.structure = structure
-        replace_data(self.weight, self.weight.new_full((structure.nnz,), AWAITING))
+        own, values = self.live()
+        values = values.detach().clone()
+        self.take(structure, self.dense())
+        self.snapshot = Snapshot(own, values, self.weight.detach().clone())
 
-    def _take(self, dense: th.Tensor) -> None:
-        """Take dense weights; a target's that lie outside the structure make a snapshot."""
-        flat = dense.detach().reshape(-1)
-        values = flat[th.from_numpy(self.structure.flat)]
-        if self.is_target:
-            own = Structure.of_mask(flat.numpy() != 0, self.structure.shape)
-            if (own.places_in(self.structure) < 0).any():
-                replace_data(self.weight, dense.new_full((self.structure.nnz,), AWAITING))
-                self.snapshot = (own, flat[th.from_numpy(own.flat)])
-                return
-        self.restructure(self.structure, values)
+    def take(self, structure: Structure, dense: th.Tensor) -> None:
+        """Have these connections from now on, with their dense weights.
+
+        :param dense: shape ``structure.shape``; what lies outside the structure is dropped
+        """
+        self.restructure(structure, dense.detach().reshape(-1)[th.from_numpy(structure.flat)])
+
+    def take_saved(self, dense: th.Tensor) -> None:
+        """Have these dense weights; a target's that lie outside its connections are a snapshot.
+
+        :param dense: shape ``structure.shape``
+        """
+        own = Structure.of_mask(dense.numpy() != 0, self.structure.shape)
+        self.take(self.structure, dense)
+        if self.is_target and (own.places_in(self.structure) < 0).any():
+            values = dense.reshape(-1)[th.from_numpy(own.flat)]
+            self.snapshot = Snapshot(own, values, self.weight.detach().clone())
 
     def _save_to_state_dict(self, destination: Any, prefix: str, keep_vars: bool) -> None:
         super()._save_to_state_dict(destination, prefix, keep_vars)
@@ -130,6 +168,10 @@ class CompactLinear(nn.Linear):
     ) -> None:  # fmt: skip
         weight = state_dict.get(prefix + "weight")
         mask = state_dict.pop(prefix + MASK_KEY, None)
+        if self.is_target:
+            mask = None  # it goes by that of the online layer
+        elif mask is None and strict:
+            missing_keys.append(prefix + MASK_KEY)
         for name, tensor in (("weight", weight), (MASK_KEY, mask)):
             if tensor is not None and tuple(tensor.shape) != self.structure.shape:
                 error_msgs.append(
@@ -138,17 +180,30 @@ class CompactLinear(nn.Linear):
                     f"{self.structure.shape}."
                 )
                 return
-        if mask is not None and not self.is_target:
-            if not bool(mask.any()):
-                raise CorruptStateError(f"the mask of {prefix}weight has no connection")
-            self.structure = Structure.of_mask(mask.cpu().numpy(), self.structure.shape)
-            if weight is None:
-                self.restructure(self.structure, self.weight.new_zeros(self.structure.nnz))
+        if mask is not None:
+            check_mask(mask, f"{prefix}weight")
+            structure = Structure.of_mask(mask.cpu().numpy(), self.structure.shape)
+            if not structure.equals(self.structure):
+                self.take(structure, self.dense())
         if weight is not None:
-            self._take(weight.to(device="cpu", dtype=th.float32))
+            self.take_saved(weight.to(device="cpu", dtype=th.float32))
             state_dict[prefix + "weight"] = self.weight.detach().clone()
         super()._load_from_state_dict(
             state_dict, prefix, local_metadata, strict, missing_keys, unexpected_keys, error_msgs
+        )
+
+
+def check_mask(mask: th.Tensor, name: str) -> None:
+    """Refuse a mask without any connection.
+
+    :param mask: of any shape, True or not 0 where active
+    :param name: of the weight that it belongs to
+    :raises CorruptStateError: if nothing is active
+    """
+    if not bool(mask.any()):
+        raise CorruptStateError(
+            f"the mask of {name} has no connection, but every layer has at least one; the file is "
+            "damaged"
         )
 
 

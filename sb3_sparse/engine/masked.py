@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,9 +18,17 @@ from sb3_sparse.engine.gradients import (
 )
 from sb3_sparse.engine.kernels import Kernel
 from sb3_sparse.engine.layers import SparseLayer, moments_of
-from sb3_sparse.engine.linear import MASK_KEY
+from sb3_sparse.engine.linear import MASK_KEY, check_mask
 
 FLOAT_MASK_KEY = "weight_mask_float"
+
+
+def _check_mask_key(
+    module: nn.Module, state_dict: dict[str, Any], prefix: str, *_: object
+) -> None:
+    """Pre-load hook of a layer."""
+    if (mask := state_dict.get(prefix + MASK_KEY)) is not None:
+        check_mask(mask, f"{prefix}weight")
 
 
 def _ignore_mask_key(
@@ -44,11 +52,24 @@ class MaskedLayer(SparseLayer):
     def __init__(self, name: str, module: Kernel) -> None:
         super().__init__(name, module, tuple(module.weight.shape))
         self._targets: list[Kernel] = []
+        self._connections = object()
         ones = th.ones_like(module.weight, requires_grad=False)
         module.register_buffer(MASK_KEY, ones.bool())
         module.register_buffer(FLOAT_MASK_KEY, ones, persistent=False)
-        hook = module.register_load_state_dict_post_hook(self._after_load)  # type: ignore[no-untyped-call]
-        self._hooks: list[Any] = [hook]
+        self._hooks: list[Any] = [
+            module.register_load_state_dict_pre_hook(_check_mask_key),  # type: ignore[no-untyped-call]
+            module.register_load_state_dict_post_hook(self._after_load),  # type: ignore[no-untyped-call]
+            module.register_state_dict_pre_hook(self._before_save),  # type: ignore[no-untyped-call]
+        ]
+
+    @staticmethod
+    def of(module: nn.Module) -> MaskedLayer | None:
+        """The masked layer of a module, if it is one."""
+        for hook in module._load_state_dict_post_hooks.values():
+            layer = getattr(hook, "__self__", None)
+            if isinstance(layer, MaskedLayer) and layer.module is module:
+                return layer
+        return None
 
     @property
     def targets(self) -> Sequence[Kernel]:
@@ -77,8 +98,10 @@ class MaskedLayer(SparseLayer):
     def add_target(self, module: Kernel) -> None:
         """Make ``module`` a target copy of this layer; it takes the weights that the layer has."""
         self._targets.append(module)
-        hook = module.register_load_state_dict_pre_hook(_ignore_mask_key)  # type: ignore[no-untyped-call]
-        self._hooks.append(hook)
+        self._hooks += [
+            module.register_load_state_dict_pre_hook(_ignore_mask_key),  # type: ignore[no-untyped-call]
+            module.register_load_state_dict_post_hook(self._after_target_load),  # type: ignore[no-untyped-call]
+        ]
         self.sync_targets()
 
     def sync_targets(self) -> None:
@@ -101,20 +124,24 @@ class MaskedLayer(SparseLayer):
         buffer.copy_(th.from_numpy(np.ascontiguousarray(mask)).view(self.shape))
         self.apply_mask()
 
-    def set_weights(self, weights: NDArray[np.float32]) -> None:
-        """Replace the active weights; what is inactive stays 0.
+    def mask_gradient(self) -> None:
+        if self.weight.grad is not None:
+            self.weight.grad.mul_(self.float_mask)
 
-        :param weights: shape ``(size,)`` or the weight's shape
-        """
+    def write(self, dense: th.Tensor) -> None:
         with th.no_grad():
-            self.weight.copy_(th.from_numpy(np.ascontiguousarray(weights)).view(self.shape))
-        self.apply_mask()
+            self.weight.copy_(dense.view(self.shape))
+        self.remask()
+
+    def _dense_targets(self) -> Iterable[NDArray[np.float32]]:
+        return (target.weight.detach().cpu().numpy() for target in self._targets)
 
     def apply_mask(self) -> None:
         """Bring float mask, nnz and weight in line with the boolean mask."""
         mask = self.module.get_buffer(MASK_KEY)
         self.float_mask.copy_(mask)
         self.nnz = int(mask.sum())
+        self._connections = object()
         with th.no_grad():
             self.weight.mul_(self.float_mask)
 
@@ -134,6 +161,16 @@ class MaskedLayer(SparseLayer):
                 state[key] = th.zeros_like(self.weight)
                 state[key][self.module.get_buffer(MASK_KEY)] = value
         self.moments_stale = False
+
+    @property
+    def connections(self) -> object:
+        return self._connections
+
+    def follow(self, optimizer: th.optim.Optimizer, since: object) -> None:
+        if since is not self._connections:
+            for _, _, value in moments_of([optimizer], self.weight):
+                if value.shape == self.weight.shape:
+                    value.mul_(self.float_mask)
 
     def saved_moment(self, moment: th.Tensor) -> th.Tensor:
         return moment
@@ -162,5 +199,12 @@ class MaskedLayer(SparseLayer):
         del self.module._buffers[MASK_KEY], self.module._buffers[FLOAT_MASK_KEY]
 
     def _after_load(self, module: nn.Module, incompatible_keys: object) -> None:
+        mask = self.module.get_buffer(MASK_KEY)
+        moved = not th.equal(self.float_mask, mask.to(self.float_mask.dtype))
         self.apply_mask()
         self.moments_stale = True
+        if moved:
+            self.mask_targets()
+
+    def _before_save(self, module: nn.Module, prefix: str, keep_vars: bool) -> None:
+        self.remask()

@@ -53,10 +53,6 @@ class SparseNetwork:
         assert isinstance(optimizer, th.optim.Optimizer)
         return optimizer
 
-    @optimizer.setter
-    def optimizer(self, optimizer: th.optim.Optimizer) -> None:
-        vars(self.owner)["optimizer"] = optimizer
-
     @property
     def kernels(self) -> list[th.Tensor]:
         """Weights of all Linear and Conv layers, the ones left dense too."""
@@ -76,7 +72,7 @@ class SparseNetwork:
     @property
     def denser(self) -> bool:
         """Whether a layer still has more connections than the requested sparsity leaves it."""
-        return any(layer.nnz > layer.final_nnz for layer in self.layers)
+        return any(layer.nnz > layer.final_nnz and not layer.frozen for layer in self.layers)
 
     def initialise(
         self,
@@ -108,8 +104,11 @@ class SparseNetwork:
             layer.set_mask(mask)
             if gains is not None:
                 gain = gains[layer.name]
-                layer.set_weights(sparsity_aware_weights(mask, seed, layer.name, gain))
+                weights = sparsity_aware_weights(mask, seed, layer.name, gain)
+                layer.write(th.from_numpy(weights))
 
     def take_gradients(self, masks: dict[str, GradientMask]) -> dict[str, DenseGradient | None]:
         """Dense gradients of the step that is about to happen, by layer name."""
-        return {layer.name: masks[layer.name].take() for layer in self.layers}
+        return {
+            layer.name: masks[layer.name].take() for layer in self.layers if layer.name in masks
+        }

@@ -85,6 +85,14 @@ class Structure:
         row = np.repeat(np.arange(self.shape[0], dtype=np.int64), counts)
         return row * self.shape[1] + self.column
 
+    def equals(self, other: Structure) -> bool:
+        """Whether both have the same connections."""
+        return (
+            self.shape == other.shape
+            and np.array_equal(self.row_start, other.row_start)
+            and np.array_equal(self.column, other.column)
+        )
+
     def mask(self) -> NDArray[np.bool_]:
         """True where active, shape ``(rows * columns,)``."""
         mask = np.zeros(self.shape[0] * self.shape[1], dtype=np.bool_)

@@ -7,15 +7,22 @@ from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtr
 from sb3_sparse.errors import MissingExtra
 from sb3_sparse.policies.critics import PassesGradientsOn, SparseCriticsMixin
 from sb3_sparse.policies.mixin import SparsePolicyMixin, with_extractor
+from sb3_sparse.policies.parts import SparsePart
 from sb3_sparse.policies.sac import GAUSSIAN_ACTOR, TWIN_CRITIC
 from sb3_sparse.policies.spec import NetworkSpec
 
 try:
+    from sb3_contrib.crossq.policies import Actor as CrossQActor
     from sb3_contrib.crossq.policies import CrossQCritic, CrossQPolicy
-    from sb3_contrib.qrdqn.policies import QRDQNPolicy
+    from sb3_contrib.qrdqn.policies import QRDQNPolicy, QuantileNetwork
+    from sb3_contrib.tqc.policies import Actor as TQCActor
     from sb3_contrib.tqc.policies import Critic, TQCPolicy
 except ImportError as error:
     raise MissingExtra("a sparse policy of TQC, QRDQN, CrossQ or TRPO", "contrib") from error
+
+
+class SparseTQCActor(SparsePart, TQCActor):
+    """Actor of TQC."""
 
 
 class SparseTQCCritic(PassesGradientsOn, Critic):
@@ -25,6 +32,7 @@ class SparseTQCCritic(PassesGradientsOn, Critic):
 class SparseTQCPolicy(SparseCriticsMixin, TQCPolicy):
     """Sparse actor and quantile critics for TQC."""
 
+    actor_class = SparseTQCActor
     critic_class = SparseTQCCritic
     networks = {"actor": GAUSSIAN_ACTOR, "critic": TWIN_CRITIC}
 
@@ -32,6 +40,10 @@ class SparseTQCPolicy(SparseCriticsMixin, TQCPolicy):
 SparseTQCMlpPolicy = with_extractor(SparseTQCPolicy, "Mlp", FlattenExtractor)
 SparseTQCCnnPolicy = with_extractor(SparseTQCPolicy, "Cnn", NatureCNN)
 SparseTQCMultiInputPolicy = with_extractor(SparseTQCPolicy, "MultiInput", CombinedExtractor)
+
+
+class SparseQuantileNetwork(SparsePart, QuantileNetwork):
+    """Quantile network of QR-DQN."""
 
 
 class SparseQRDQNPolicy(SparsePolicyMixin, QRDQNPolicy):
@@ -46,10 +58,19 @@ class SparseQRDQNPolicy(SparsePolicyMixin, QRDQNPolicy):
         )
     }
 
+    def make_quantile_net(self) -> SparseQuantileNetwork:
+        """As in sb3-contrib, of our class."""
+        kwargs = self._update_features_extractor(self.net_args, features_extractor=None)
+        return SparseQuantileNetwork(**kwargs).to(self.device)
+
 
 SparseQRDQNMlpPolicy = with_extractor(SparseQRDQNPolicy, "Mlp", FlattenExtractor)
 SparseQRDQNCnnPolicy = with_extractor(SparseQRDQNPolicy, "Cnn", NatureCNN)
 SparseQRDQNMultiInputPolicy = with_extractor(SparseQRDQNPolicy, "MultiInput", CombinedExtractor)
+
+
+class SparseCrossQActor(SparsePart, CrossQActor):
+    """Actor of CrossQ."""
 
 
 class SparseCrossQCritic(PassesGradientsOn, CrossQCritic):
@@ -59,6 +80,7 @@ class SparseCrossQCritic(PassesGradientsOn, CrossQCritic):
 class SparseCrossQPolicy(SparseCriticsMixin, CrossQPolicy):
     """Sparse actor and critics for CrossQ, which has no target network."""
 
+    actor_class = SparseCrossQActor
     critic_class = SparseCrossQCritic
     networks = {
         "actor": GAUSSIAN_ACTOR,

@@ -7,12 +7,13 @@ from contextlib import contextmanager
 from typing import Any, ClassVar
 
 import torch as th
-from stable_baselines3.common.policies import BaseModel, ContinuousCritic
+from stable_baselines3.common.policies import ContinuousCritic
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
 from sb3_sparse.policies.gaussian import quicken
 from sb3_sparse.policies.mixin import SparsePolicyMixin
+from sb3_sparse.policies.parts import SparsePart
 
 
 @contextmanager
@@ -27,7 +28,7 @@ def _frozen(module: nn.Module) -> Iterator[None]:
             parameter.requires_grad_(True)
 
 
-class PassesGradientsOn(BaseModel):
+class PassesGradientsOn(SparsePart):
     """A critic whose own weights get no gradient where its actions have one.
 
     That is the actor's loss, in every algorithm: SB3 computes the critic's gradients there too and
@@ -54,8 +55,15 @@ class SparseContinuousCritic(PassesGradientsOn, ContinuousCritic):
 class SparseCriticsMixin(SparsePolicyMixin):
     """What the policies of SAC, TD3, DDPG, TQC and CrossQ have in common."""
 
+    actor_class: ClassVar[type[SparsePart]]
     critic_class: ClassVar[type[PassesGradientsOn]] = SparseContinuousCritic
+    actor_kwargs: dict[str, Any]
     critic_kwargs: dict[str, Any]
+
+    def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Any:
+        """As in SB3, of :attr:`actor_class`."""
+        kwargs = self._update_features_extractor(self.actor_kwargs, features_extractor)
+        return self.actor_class(**kwargs).to(self.device)
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> Any:
         """As in SB3, of :attr:`critic_class`."""

@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, NatureCNN
-from stable_baselines3.dqn.policies import DQNPolicy
+from stable_baselines3.dqn.policies import DQNPolicy, QNetwork
 
 from sb3_sparse.policies.mixin import SparsePolicyMixin, with_extractor
+from sb3_sparse.policies.parts import SparsePart
 from sb3_sparse.policies.spec import NetworkSpec
+
+
+class SparseQNetwork(SparsePart, QNetwork):
+    """Q network of DQN."""
 
 
 class SparseDQNPolicy(SparsePolicyMixin, DQNPolicy):
@@ -20,6 +25,11 @@ class SparseDQNPolicy(SparsePolicyMixin, DQNPolicy):
             target="q_net_target",
         )
     }
+
+    def make_q_net(self) -> SparseQNetwork:
+        """As in SB3, of our class."""
+        kwargs = self._update_features_extractor(self.net_args, features_extractor=None)
+        return SparseQNetwork(**kwargs).to(self.device)
 
 
 SparseDQNMlpPolicy = with_extractor(SparseDQNPolicy, "Mlp", FlattenExtractor)

@@ -9,7 +9,6 @@ from typing import Any, ClassVar, TypeVar
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.distributions import Distribution
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import Schedule
@@ -17,15 +16,17 @@ from stable_baselines3.common.type_aliases import Schedule
 from sb3_sparse.engine.auto import AutoCompute
 from sb3_sparse.engine.controller import Controller
 from sb3_sparse.engine.linear import check_conversion
-from sb3_sparse.engine.optimizers import check_weight_decay, rebuild
+from sb3_sparse.engine.optimizers import check_weight_decay, prefer_fused
 from sb3_sparse.errors import CorruptStateError
 from sb3_sparse.policies.build import build_networks
 from sb3_sparse.policies.compiled import names_in, plain_names
 from sb3_sparse.policies.config import SparsityConfig
 from sb3_sparse.policies.extractors import choose_extractor
 from sb3_sparse.policies.named import import_named
+from sb3_sparse.policies.parts import without_graphs
 from sb3_sparse.policies.report import SparsityReport, report_on
 from sb3_sparse.policies.spec import NetworkSpec
+from sb3_sparse.policies.vectors import from_vector, to_vector
 
 Sparse = TypeVar("Sparse", bound="SparsePolicyMixin")
 
@@ -103,8 +104,8 @@ class SparsePolicyMixin(BasePolicy):
         self.sparsity_config = config
         seed = drawn_seed if mask_seed is None else mask_seed
         networks = build_networks(self, self.networks, config, seed, self._initial_gain)
-        for network in {id(network.owner): network for network in networks}.values():
-            network.optimizer = rebuild(network.optimizer, self.optimizer_kwargs)
+        for network in networks:
+            prefer_fused(network.optimizer)
         auto = AutoCompute() if compute == "auto" else None
         self.sparse = Controller(networks, seed, self.functional_gradients, weight_decay, auto)
         if compute == "sparse":
@@ -114,11 +115,7 @@ class SparsePolicyMixin(BasePolicy):
         self.sparse.attach()
 
     def __deepcopy__(self: Sparse, memo: dict[int, Any]) -> Sparse:
-        # What an action distribution remembers of the last minibatch hangs on that graph, which
-        # torch refuses to copy. Every forward pass makes it anew, so it can be cut off.
-        for module in self.modules():
-            if "action_dist" in vars(module):
-                vars(module)["action_dist"] = _without_graph(vars(module)["action_dist"])
+        memo.update(without_graphs(self))
         twin = type(self).__new__(type(self))
         memo[id(self)] = twin
         twin.__dict__.update(copy.deepcopy(self.__dict__, memo))
@@ -143,21 +140,35 @@ class SparsePolicyMixin(BasePolicy):
         return 1.0
 
     def sparsity_report(self) -> SparsityReport:
-        """Every layer's shape, nnz, density and FLOPs; ``print`` it for a table."""
+        """Every layer's shape, nnz, density and FLOPs; ``print`` it for a table.
+
+        :raises UnsupportedError: if a sparse layer was replaced by another module
+        """
+        self.sparse.check_places(self)
+        self.sparse.enforce()
         return report_on(self)
 
     def set_training_mode(self, mode: bool) -> None:
         """As in SB3. Every ``train()`` calls it first: here a copied policy gets its hooks back."""
         super().set_training_mode(mode)
+        self.sparse.check_places(self)
         if mode:
             self.sparse.begin_training(self)
+        else:
+            self.sparse.enforce()  # before anybody acts with what others have written
+
+    def parameters_to_vector(self) -> np.ndarray[Any, Any]:
+        """As in SB3; kernels are dense in every storage, 0 where inactive."""
+        return to_vector(self)
 
     def load_from_vector(self, vector: np.ndarray[Any, Any]) -> None:
-        """As in SB3; what the masks have inactive stays 0."""
-        super().load_from_vector(vector)
+        """As in SB3; what the masks have inactive stays 0, and a warning says so.
+
+        :raises ConfigError: if the vector has another length
+        """
+        from_vector(self, vector)
         for layer in self.sparse.layers:
-            layer.remask()
-            layer.mask_targets()
+            layer.settle_targets(soft=False)
 
     def load_state_dict(
         self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False
@@ -243,17 +254,6 @@ def peek_seed() -> int:
     generator = th.Generator()
     generator.set_state(th.get_rng_state())
     return int(th.randint(2**63 - 1, (), generator=generator))
-
-
-def _without_graph(action_dist: Any) -> Distribution:
-    """A copy of SB3's action distribution that holds no graph."""
-    twin: Distribution = copy.copy(action_dist)
-    for name, value in vars(twin).items():
-        if isinstance(value, th.Tensor):
-            setattr(twin, name, value.detach())
-        elif name in ("distribution", "weights_dist"):
-            setattr(twin, name, None)
-    return twin
 
 
 def with_extractor(

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, NatureCNN
-from stable_baselines3.sac.policies import SACPolicy
+from stable_baselines3.sac.policies import Actor, SACPolicy
 
 from sb3_sparse.policies.critics import SparseCriticsMixin
 from sb3_sparse.policies.mixin import with_extractor
+from sb3_sparse.policies.parts import SparsePart
 from sb3_sparse.policies.spec import NetworkSpec
 
 GAUSSIAN_ACTOR = NetworkSpec(
@@ -24,9 +25,14 @@ TWIN_CRITIC = NetworkSpec(
 )
 
 
+class SparseSACActor(SparsePart, Actor):
+    """Actor of SAC."""
+
+
 class SparseSACPolicy(SparseCriticsMixin, SACPolicy):
     """Sparse actor and critics for SAC."""
 
+    actor_class = SparseSACActor
     networks = {"actor": GAUSSIAN_ACTOR, "critic": TWIN_CRITIC}
 
 

@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, NatureCNN
-from stable_baselines3.td3.policies import TD3Policy
+from stable_baselines3.td3.policies import Actor, TD3Policy
 
 from sb3_sparse.policies.critics import SparseCriticsMixin
 from sb3_sparse.policies.mixin import with_extractor
+from sb3_sparse.policies.parts import SparsePart
 from sb3_sparse.policies.sac import TWIN_CRITIC
 from sb3_sparse.policies.spec import NetworkSpec
+
+
+class SparseTD3Actor(SparsePart, Actor):
+    """Actor of TD3 and DDPG."""
 
 
 class SparseTD3Policy(SparseCriticsMixin, TD3Policy):
     """Sparse actor and critics for TD3 and DDPG."""
 
+    actor_class = SparseTD3Actor
     networks = {
         "actor": NetworkSpec(
             roots=("actor",),

@@ -14,7 +14,7 @@ from stable_baselines3.common.utils import polyak_update
 from torch import nn
 
 from sb3_sparse.engine.compact import CompactLayer
-from sb3_sparse.engine.linear import AWAITING, CompactLinear, replace_data
+from sb3_sparse.engine.linear import CompactLinear, replace_data
 from sb3_sparse.engine.masked import MaskedLayer
 from sb3_sparse.errors import CorruptStateError, TopologyError, UnsupportedError
 from sb3_sparse.topology import Exchange
@@ -128,13 +128,32 @@ def test_a_hard_target_computes_with_its_snapshot_until_it_is_copied():
         expected = side.target(x)
         side.layer.move(exchange_of(side.layer, 4, 2), soft_targets=False)
         assert side.target.weight.shape == (side.layer.nnz,)
-        assert (side.target.weight == AWAITING).all()
+        kept = before.reshape(-1)[side.layer.mask()]
+        np.testing.assert_array_equal(side.target.weight, kept)
         np.testing.assert_array_equal(side.target(x), expected)
         side.layer.move(exchange_of(side.layer, 1, 3, seed=1), soft_targets=False)
         np.testing.assert_array_equal(side.target.dense(), before)
+    step(side)
+    with th.no_grad():
         polyak_update(side.module.parameters(), side.target.parameters(), 1.0)
         np.testing.assert_array_equal(side.target(x), side.module(x))
     assert side.target.snapshot is None
+
+
+def test_whoever_writes_a_hard_target_after_a_move_ends_its_snapshot_with_finite_weights():
+    _, side = twins()
+    before = side.target.dense().reshape(-1).numpy()
+    side.layer.move(exchange_of(side.layer, 4, 2), soft_targets=False)
+    step(side)
+    kept = before * side.layer.mask()
+    with th.no_grad():
+        polyak_update(side.module.parameters(), side.target.parameters(), 0.25)
+    blended = 0.75 * kept + 0.25 * side.layer.dense()
+    np.testing.assert_allclose(side.target.dense().reshape(-1), blended, rtol=1e-6)
+    side.layer.move(exchange_of(side.layer, 2, 2, seed=1), soft_targets=False)
+    side.target.weight.data.clamp_(-0.01, 0.01)
+    clamped = np.clip(blended * side.layer.mask(), -0.01, 0.01)
+    np.testing.assert_allclose(side.target.dense().reshape(-1), clamped, rtol=1e-6)
 
 
 def test_a_target_with_weights_outside_the_mask_keeps_them_when_loaded():
@@ -142,7 +161,8 @@ def test_a_target_with_weights_outside_the_mask_keeps_them_when_loaded():
     dense = {k: th.randn_like(v) for k, v in nn.Linear(COLUMNS, ROWS).state_dict().items()}
     side.target.load_state_dict(dense)
     np.testing.assert_array_equal(side.target.state_dict()["weight"], dense["weight"])
-    assert (side.target.weight == AWAITING).all()
+    kept = dense["weight"].reshape(-1)[side.layer.mask()]
+    np.testing.assert_array_equal(side.target.weight.detach(), kept)
     side.layer.mask_targets()
     np.testing.assert_array_equal(
         side.target.dense().reshape(-1), dense["weight"].reshape(-1) * side.layer.mask()
@@ -186,7 +206,9 @@ def test_either_storage_takes_up_what_the_other_saved(first):
 def test_weights_without_a_mask_are_masked():
     _, compact = twins()
     dense = nn.Linear(COLUMNS, ROWS).state_dict()
-    compact.module.load_state_dict(dense)
+    with pytest.raises(RuntimeError, match='Missing key.*"weight_mask"'):
+        compact.module.load_state_dict(dense)
+    compact.module.load_state_dict(dense, strict=False)
     mask = compact.layer.mask()
     np.testing.assert_array_equal(compact.layer.dense(), dense["weight"].reshape(-1) * mask)
 

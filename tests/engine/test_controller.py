@@ -30,7 +30,7 @@ def rig(method="rigl", optimizer=None, functional=False, **plan):
     network = SparseNetwork("net", owner, [("0", owner[0])])
     layer = network.layers[0]
     layer.set_mask(np.tile([True, True, False, False], 3))
-    layer.set_weights(np.array(WEIGHTS, dtype=np.float32))
+    layer.write(th.tensor(WEIGHTS))
     layer.final_nnz = layer.initial_nnz = 6
     controller = Controller([network], seed=1, functional_gradients=functional)
     controller.attach()

@@ -1,0 +1,90 @@
+"""All parameters as one vector, dense in every storage: what SB3's evolution strategies use."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import numpy as np
+import torch as th
+from numpy.typing import NDArray
+from torch import nn
+
+from sb3_sparse.engine.linear import CompactLinear
+from sb3_sparse.engine.masked import MaskedLayer
+from sb3_sparse.errors import ConfigError
+
+
+def to_vector(root: nn.Module) -> NDArray[np.float32]:
+    """Every parameter in the order of ``root.parameters()``, kernels dense and 0 where inactive.
+
+    :param root: a policy, or an actor or critic of one
+    :return: shape ``(n,)``, ``n`` the number of parameters of the dense network
+    """
+    layers = _layers(root)
+    parts = []
+    for parameter in root.parameters():
+        layer = layers.get(id(parameter))
+        if isinstance(layer, MaskedLayer):
+            layer.remask()
+        dense = layer.dense() if isinstance(layer, CompactLinear) else parameter.detach()
+        parts.append(dense.reshape(-1).cpu().numpy())
+    return np.concatenate(parts)
+
+
+def from_vector(root: nn.Module, vector: NDArray[Any]) -> None:
+    """Load what :func:`to_vector` gave, from any storage and any mask.
+
+    A value of an inactive connection is dropped; a warning says how many were not 0.
+
+    :param root: a policy, or an actor or critic of one
+    :param vector: shape ``(n,)``
+    :raises ConfigError: if it has another shape; nothing is loaded then
+    """
+    values = th.as_tensor(vector, dtype=th.float32)
+    layers = _layers(root)
+    parameters = list(root.parameters())
+    sizes = [_size(parameter, layers.get(id(parameter))) for parameter in parameters]
+    if values.shape != (sum(sizes),):
+        raise ConfigError(
+            f"the vector has the shape {tuple(values.shape)}; {type(root).__name__} takes "
+            f"({sum(sizes)},): every parameter of the dense network, as parameters_to_vector() "
+            "gives them, with 0 where a connection is inactive"
+        )
+    dropped = 0
+    for parameter, part in zip(parameters, values.split(sizes), strict=True):
+        layer = layers.get(id(parameter))
+        if layer is None:
+            with th.no_grad():
+                parameter.copy_(part.view_as(parameter))
+            continue
+        if isinstance(layer, CompactLinear):
+            layer.take_saved(part.clone())
+            kept = layer.dense()
+        else:
+            layer.write(part)
+            kept = parameter.detach()
+        dropped += int(part.count_nonzero() - kept.count_nonzero())
+    if dropped:
+        warnings.warn(
+            f"{dropped} of the vector's values belong to inactive connections and were dropped; "
+            "what is inactive stays 0",
+            stacklevel=3,
+        )
+
+
+def _layers(root: nn.Module) -> dict[int, CompactLinear | MaskedLayer]:
+    """The sparse layer that each weight belongs to, by the weight's id."""
+    found: dict[int, CompactLinear | MaskedLayer] = {}
+    for module in root.modules():
+        if isinstance(module, CompactLinear):
+            found[id(module.weight)] = module
+        elif (layer := MaskedLayer.of(module)) is not None:
+            found[id(layer.weight)] = layer
+    return found
+
+
+def _size(parameter: nn.Parameter, layer: CompactLinear | MaskedLayer | None) -> int:
+    if isinstance(layer, CompactLinear):
+        return layer.in_features * layer.out_features
+    return parameter.numel()
