@@ -8,6 +8,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_sparse.engine.plan import Plan
 from sb3_sparse.errors import ConfigError
+from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.policies.mixin import SparsePolicyMixin
 from sb3_sparse.topology import method_named
 
@@ -22,9 +23,7 @@ class SparsityCallback(BaseCallback):
 
     Logged: ``sparsity/total``, ``sparsity/<network>``, ``sparsity/nnz``, ``sparsity/mask_updates``,
     ``sparsity/mask_churn`` (share of the active connections that the last update dropped),
-    ``sparsity/drop_fraction`` and ``sparsity/compact_layers`` (how many compute on non-zeros). What
-    ``compute="auto"`` chose and expects to gain is said once, in the log and as
-    ``sparsity/expected_speedup`` of the layers it measured.
+    ``sparsity/drop_fraction`` and ``sparsity/compact_layers`` (how many compute on non-zeros).
 
     :param method: ``"static"``, ``"set"``, ``"rigl"``, ``"prune"`` or a registered one
     :param update_interval: gradient steps of a network's own optimizer between two updates
@@ -55,7 +54,6 @@ class SparsityCallback(BaseCallback):
         verbose: int = 0,
     ) -> None:
         super().__init__(verbose)
-        self._said: object = None
         topology = method_named(method)
         given = {
             "update_interval": update_interval,
@@ -74,7 +72,7 @@ class SparsityCallback(BaseCallback):
         self.plan = Plan(method, **{**DEFAULTS, "begin": topology.default_begin, **given})  # type: ignore[arg-type]
 
     def _sparse_policy(self) -> SparsePolicyMixin:
-        policy = self.model.policy
+        policy = unwrapped(self.model.policy)
         if not isinstance(policy, SparsePolicyMixin):
             raise ConfigError(
                 f"SparsityCallback needs a sparse policy, got {type(policy).__name__}; make the "
@@ -164,9 +162,3 @@ class SparsityCallback(BaseCallback):
         record("sparsity/mask_churn", max(network.churn for network in networks))
         record("sparsity/drop_fraction", self.plan.drop_fraction_at(sparse.progress))
         record("sparsity/compact_layers", sum(layer.compact for layer in sparse.layers))
-        choice = sparse.choice
-        if choice is not None:
-            record("sparsity/expected_speedup", choice.speedup)
-            if choice is not self._said:
-                self.logger.log(str(choice))
-                self._said = choice

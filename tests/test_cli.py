@@ -33,7 +33,6 @@ def test_train_says_what_it_does_and_enjoy_and_inspect_read_it(tmp_path):
     assert done.returncode == 0, done.stderr
     assert "Training DQN on CartPole-v1, rigl at 90% (ERK), seed 3" in done.stdout
     assert re.search(r"1500 of 1500 steps, return \d+\.\d, sparsity 8\d\.\d\d%", done.stdout)
-    assert done.stdout.count("compute='auto' keeps masks: no linear layer") == 1
     assert "Return over 20 episodes:" in done.stdout
     folder = Path("logs") / "dqn" / "CartPole-v1_1"
     for what, name in (("Last policy", "CartPole-v1.zip"), ("Best policy", "best_model.zip")):
@@ -52,29 +51,25 @@ def test_train_says_what_it_does_and_enjoy_and_inspect_read_it(tmp_path):
     nnz, density = re.search(r"total\s+(\d+)\s+(0\.\d+)", done.stdout).groups()
     assert 72 <= int(nnz) <= 75
     assert float(density) == round(int(nnz) / 720, 4)
-    assert "On this machine compute='auto' keeps masks: no linear layer" in done.stdout
+    assert "compute='auto' keeps masks: no linear layer" in done.stdout
 
 
 @pytest.mark.parametrize("compute", ["auto", "sparse"])
-def test_inspect_says_how_large_layers_compute_best(tmp_path, compute):
+def test_inspect_says_how_large_layers_compute(tmp_path, compute):
     kwargs = dict(sparsity=0.99, net_arch=[300, 300], compute=compute)
     make("SAC", policy_kwargs=kwargs, batch_size=128).save(tmp_path / "model")
     done = sb3_sparse("inspect", "model.zip", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert re.search(
-        r"On this machine compute='auto' \(batch 128, 1 thread\): \d of 8 layers measured compute "
-        r"on non-zeros, which should take \d+\.\d\d instead of \d+\.\d\d ms forward and backward",
-        done.stdout,
-    )
-    line = r"critic\.qf1\.2 +(non-zeros|masked) +\d+\.\d{3} ms \(masked \d+\.\d{3} ms\)"
-    assert re.search(line, done.stdout)
+    layers = "actor.latent_pi.0, actor.latent_pi.2, critic.qf0.0, critic.qf0.2, critic.qf0.4"
+    chosen = f"compute='auto' computes on non-zeros here: {layers}"
+    assert (chosen in done.stdout) == (compute == "auto")
     assert ("was made with compute='sparse'" in done.stdout) == (compute == "sparse")
 
 
 def test_inspect_of_a_damaged_file_and_of_a_model_without_minibatches(tmp_path):
     make("A2C", n_steps=6).save(tmp_path / "model")
     done = sb3_sparse("inspect", "model.zip", cwd=tmp_path)
-    assert "On this machine compute='auto' keeps masks" in done.stdout, done.stderr
+    assert "compute='auto' keeps masks" in done.stdout, done.stderr
     with zipfile.ZipFile(tmp_path / "half.zip", "w") as half:
         half.writestr("_stable_baselines3_version", "2.9.2")
     done = sb3_sparse("inspect", "half.zip", cwd=tmp_path)
@@ -133,8 +128,14 @@ def test_options_and_a_second_run_beside_the_first(tmp_path):
 @pytest.mark.parametrize(
     ("args", "message"),
     [
-        (["--algo", "dqnn"], "unknown algorithm 'dqnn'; allowed are dqn, sac, td3"),
-        (["--env", "CartPool-v1"], "unknown environment 'CartPool-v1'; did you mean 'CartPole-v1'"),
+        (
+            ["--algo", "dqnn"],
+            "unknown algorithm 'dqnn' (did you mean 'dqn'?); allowed are dqn",
+        ),
+        (
+            ["--env", "CartPool-v1"],
+            "'CartPool-v1' (did you mean 'CartPole-v1'?)",
+        ),
         (["--method", "riggle"], "no config is shipped for method 'riggle', only for dense, "),
         (["--sparsity", "1.5"], "must lie in [0, 1)"),
         (["--distribution", "flat"], "allowed are er, erk, uniform"),
@@ -144,7 +145,10 @@ def test_options_and_a_second_run_beside_the_first(tmp_path):
         (["--hyperparams", "gama:0.9"], "did you mean 'gamma'?"),
         (["--hyperparams", "gamma"], "given as name:value"),
         (["gamma:0.9"], "unexpected argument 'gamma:0.9'"),
-        (["--hyperparams", "learning_rate:fast"], "learning_rate must be a number, or lin_"),
+        (
+            ["--hyperparams", "learning_rate:fast"],
+            "learning_rate must be a number, 0 or more, ",
+        ),
         (["--hyperparams", "optimizer_kwargs:{'epz':1}"], "do not work: TypeError"),
         (["--resume", "nowhere"], "no run of sb3-sparse in nowhere"),
         (["--resume", "nowhere", "--seed", "3"], "--resume takes everything from the run; drop"),
@@ -157,7 +161,7 @@ def test_mistakes_are_one_line_and_make_nothing(args, message, tmp_path, mistake
 
 
 def test_enjoy_of_what_is_no_run(mistake):
-    assert "there is no run in nowhere" in mistake("enjoy", "nowhere")
+    assert "there is no file nowhere; give a model saved by SB3" in mistake("enjoy", "nowhere")
 
 
 @pytest.mark.parametrize(

@@ -18,6 +18,7 @@ from sb3_sparse.errors import ConfigError
 from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.policies.mixin import SparsePolicyMixin
 from sb3_sparse.policies.report import LayerReport, SparsityReport, report_on
+from sb3_sparse.sparsity.numeric import is_whole
 
 
 @dataclass(frozen=True)
@@ -163,7 +164,7 @@ def flops(
     model = policy_or_model
     passes = passes_of(model)
     size = batch_size_of(model) if batch_size is None else batch_size
-    if isinstance(size, bool) or not isinstance(size, int) or size < 1:
+    if not is_whole(size) or size < 1:
         raise ConfigError(f"batch_size must be an integer, 1 or more, got {size!r}")
     policy = unwrapped(model.policy)
     times = _times(policy, passes)

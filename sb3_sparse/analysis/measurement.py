@@ -14,6 +14,7 @@ from sb3_sparse.analysis.batches import has_batch
 from sb3_sparse.errors import ConfigError, CorruptStateError
 from sb3_sparse.loading.guard import reading
 from sb3_sparse.loading.text import read_text
+from sb3_sparse.sparsity.numeric import is_whole
 
 HEADS = ("timesteps", "name", "value")
 
@@ -75,7 +76,7 @@ class MeasurementCallback(BaseCallback):
 
     def __init__(self, every: int, path: str | Path | None = None, verbose: int = 0) -> None:
         super().__init__(verbose)
-        if isinstance(every, bool) or not isinstance(every, int) or every < 1:
+        if not is_whole(every) or every < 1:
             raise ConfigError(f"every must be environment steps, 1 or more, got {every!r}")
         self.every = every
         self.file = None if path is None else MeasurementFile(path)

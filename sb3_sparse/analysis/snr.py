@@ -19,6 +19,7 @@ from sb3_sparse.analysis.measurement import MeasurementCallback
 from sb3_sparse.analysis.networks import connections, dense_twin, parameters_by_network
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.policies.compiled import unwrapped
+from sb3_sparse.sparsity.numeric import is_whole
 
 CHUNK_NUMBERS = 2**23
 """Numbers that the per-sample gradients of one chunk may have."""
@@ -171,7 +172,7 @@ def gradient_snr(
     """
     losses = losses_for(model)
     for name, value in {"batch_size": batch_size, "chunk": chunk}.items():
-        if value is not None and (not isinstance(value, int) or value < 1):
+        if value is not None and (not is_whole(value) or value < 1):
             raise ConfigError(f"{name} must be an integer, 1 or more, got {value!r}")
     if batch is None:
         batch = sample_batch(model, batch_size, seed)
@@ -236,7 +237,7 @@ class GradientSNRCallback(MeasurementCallback):
         verbose: int = 0,
     ) -> None:
         super().__init__(every, path, verbose)
-        if batch_size is not None and (not isinstance(batch_size, int) or batch_size < 1):
+        if batch_size is not None and (not is_whole(batch_size) or batch_size < 1):
             raise ConfigError(f"batch_size must be an integer, 1 or more, got {batch_size!r}")
         self.batch_size = batch_size
 

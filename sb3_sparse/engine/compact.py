@@ -39,11 +39,12 @@ class CompactLayer(SparseLayer):
         layer.release()
         self.module = CompactLinear.convert(layer.module, structure, is_target=False)
         self._targets = []
+        self._hooks = [self.module.register_load_state_dict_post_hook(self._after_load)]  # type: ignore[no-untyped-call]
         for target in layer.targets:
             assert isinstance(target, nn.Linear)
             self._targets.append(CompactLinear.convert(target, structure, is_target=True))
-            target.register_load_state_dict_post_hook(self._after_target_load)  # type: ignore[no-untyped-call]
-        self.module.register_load_state_dict_post_hook(self._after_load)  # type: ignore[no-untyped-call]
+            hook = target.register_load_state_dict_post_hook(self._after_target_load)  # type: ignore[no-untyped-call]
+            self._hooks.append(hook)
         self.settle_moments(optimizers)
 
     @property
@@ -122,6 +123,29 @@ class CompactLayer(SparseLayer):
         dense = moment.new_zeros(self.size)
         dense[th.from_numpy(self._structure.flat)] = moment
         return dense.view(self.shape)
+
+    def masked(self, optimizers: Sequence[th.optim.Optimizer]) -> MaskedLayer:
+        """The same layer in masked storage; this one is taken apart.
+
+        :param optimizers: whose moments of the weight shall follow
+        """
+        mask = self.mask()
+        for state, key, value in moments_of(optimizers, self.weight):
+            state[key] = self.saved_moment(value)
+        for hook in self._hooks:
+            hook.remove()
+        targets = [target.dense() for target in self._targets]
+        for module in (self.module, *self._targets):
+            module.expand()
+        layer = MaskedLayer(self.name, self.module)
+        layer.initial_nnz, layer.final_nnz = self.initial_nnz, self.final_nnz
+        layer.set_mask(mask)
+        layer.moments_stale = self.moments_stale
+        for target, dense in zip(self._targets, targets, strict=True):
+            layer.add_target(target)
+            with th.no_grad():
+                target.weight.copy_(dense)
+        return layer
 
     def _flat(self) -> th.Tensor:
         return th.from_numpy(self.module.structure.flat)

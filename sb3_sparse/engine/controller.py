@@ -2,30 +2,29 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Container, Iterable
 from functools import partial
+from itertools import chain
 from typing import Any
 
 import torch as th
 from torch import nn
 from torch.utils.hooks import RemovableHandle
 
-from sb3_sparse.engine.auto import AutoCompute, Choice
-from sb3_sparse.engine.compact import compacted
+from sb3_sparse.engine.auto import AutoCompute
+from sb3_sparse.engine.compact import CompactLayer, compacted
 from sb3_sparse.engine.foreign import watch
 from sb3_sparse.engine.gradients import GradientMask
 from sb3_sparse.engine.hooks import Hooks
-from sb3_sparse.engine.layers import SparseLayer
+from sb3_sparse.engine.layers import SparseLayer, check_masked, save_moments
 from sb3_sparse.engine.network import SparseNetwork
 from sb3_sparse.engine.optimizers import (
     acts_elementwise,
     add_weight_decay,
     keep_implementation,
 )
-from sb3_sparse.engine.plan import Plan
+from sb3_sparse.engine.plan import Plan, warn_of_no_plan
 from sb3_sparse.engine.sequential import chain_up
-from sb3_sparse.errors import UnsupportedError
 
 
 class Controller:
@@ -57,7 +56,7 @@ class Controller:
         self.seed = seed
         self.weight_decay = weight_decay
         self.functional_gradients = functional_gradients
-        self.auto = auto
+        self._auto = auto
         self.plan: Plan | None = None
         self._in_force: Callable[[], bool] = bool
         self.progress = 0.0
@@ -70,12 +69,7 @@ class Controller:
         self._warned = False
 
     def __getstate__(self) -> dict[str, Any]:
-        return {
-            **self.__dict__,
-            "plan": None,
-            "_in_force": bool,
-            "_gradient_masks": {},
-        }
+        return {**self.__dict__, "plan": None, "_in_force": bool, "_gradient_masks": {}}
 
     @property
     def layers(self) -> Iterable[SparseLayer]:
@@ -86,11 +80,6 @@ class Controller:
     def sparsity(self) -> float:
         """Removed fraction of all connections within the budgets, now."""
         return 1.0 - sum(n.nnz for n in self.networks) / sum(n.size for n in self.networks)
-
-    @property
-    def choice(self) -> Choice | None:
-        """What ``compute="auto"`` chose last, if it has."""
-        return None if self.auto is None else self.auto.choice
 
     @property
     def optimizers(self) -> list[th.optim.Optimizer]:
@@ -109,10 +98,9 @@ class Controller:
         return self._gradient_hooks.attach(weights, self._hook_gradients)
 
     def _hook_gradients(self) -> list[RemovableHandle]:
+        functional = self.functional_gradients
         self._gradient_masks = {
-            layer.name: layer.gradient_mask(
-                self.functional_gradients, partial(self._capturing, network)
-            )
+            layer.name: layer.gradient_mask(functional, partial(self._capturing, network))
             for network in self.networks
             for layer in network.layers
             if not layer.frozen
@@ -129,24 +117,10 @@ class Controller:
                 optimizer.register_state_dict_post_hook(self._saved_form),
             ]
             if not acts_elementwise(optimizer):
-                self._check_masked(optimizer)
+                owned = [n.layers for n in self.networks if n.optimizer is optimizer]
+                check_masked(optimizer, chain.from_iterable(owned))
                 handles.append(optimizer.register_step_post_hook(self._after_step))
         return handles
-
-    def _check_masked(self, optimizer: th.optim.Optimizer) -> None:
-        compact = [
-            layer.name
-            for network in self.networks
-            if network.optimizer is optimizer
-            for layer in network.layers
-            if layer.compact
-        ]
-        if compact:
-            raise UnsupportedError(
-                f"{type(optimizer).__name__} does not move each weight by itself, as Adam does, so "
-                f"it cannot move layers that store active connections only ({compact[0]}); make "
-                "the policy with compute='masked', or use another optimizer_class"
-            )
 
     def compact(self, root: nn.Module, names: Container[str] | None = None) -> None:
         """Store linear layers as their active connections from now on; they stay in place.
@@ -160,23 +134,40 @@ class Controller:
                 compacted(layer, self.optimizers) if names is None or layer.name in names else layer
                 for layer in network.layers
             ]
+        self._hook_anew(root)
+
+    def choose_storage(self, root: nn.Module) -> None:
+        """Let ``compute="auto"`` decide anew where there are other connections than the last time.
+
+        :param root: the policy
+        """
+        layers = list(self.layers)
+        if self._auto and (chosen := self._auto.choose(root, layers, self.optimizers)):
+            self.compact(root, chosen)
+
+    def expand(self, root: nn.Module) -> None:
+        """Store every layer masked from now on.
+
+        :param root: the policy
+        """
+        for network in self.networks:
+            network.layers = [
+                layer.masked(self.optimizers) if isinstance(layer, CompactLayer) else layer
+                for layer in network.layers
+            ]
+        self._auto = None
+        self._hook_anew(root)
+
+    def _hook_anew(self, root: nn.Module) -> None:
         chain_up(root)
         self._gradient_hooks.remove()
         self._optimizer_hooks.remove()
         self.attach()
 
     def begin_training(self, root: nn.Module) -> None:
-        """Called at the start of each round of gradient steps: hooks in place, nothing outdated.
-
-        :param root: the policy
-        """
+        """Start a round of gradient steps of the policy ``root``: hooks on, nothing outdated."""
         self.attach()
-        if self.auto is not None:
-            layers = list(self.layers)
-            self.auto.watch(root, layers)
-            choice = self.auto.choose(root, layers)
-            if choice is not None and choice.compact:
-                self.compact(root, choice.compact)
+        self.choose_storage(root)
         if self.plan is not None and not self._in_force():
             self.plan = None  # of a training that was interrupted
         for mask in self._gradient_masks.values():
@@ -189,24 +180,6 @@ class Controller:
         """Set to 0 what masks have inactive, whoever wrote it."""
         for layer in self.layers:
             layer.remask()
-
-    def check_places(self, root: nn.Module) -> None:
-        """Refuse a policy in which a sparse layer was replaced by another module.
-
-        :param root: the policy
-        :raises UnsupportedError: if one was
-        """
-        for layer in self.layers:
-            module: nn.Module | None = root
-            for name in layer.name.split("."):
-                module = None if module is None else module._modules.get(name)
-            if module is not layer.module:
-                raise UnsupportedError(
-                    f"{layer.name} was replaced after the policy had been made, so the new module "
-                    "is neither sparse nor counted; copy new weights into the layer that is there "
-                    "(load_state_dict, copy_), or make a policy that has the new layer from the "
-                    "beginning (net_arch, features_extractor_class or a subclass)"
-                )
 
     def start(self, plan: Plan, soft_targets: bool, in_force: Callable[[], bool]) -> None:
         """Let masks move from now on.
@@ -258,8 +231,9 @@ class Controller:
             if network.optimizer is not optimizer:
                 continue
             network.clock += 1
-            if network.denser and self.plan is None:
-                self._warn_of_no_plan()
+            if network.denser and self.plan is None and not self._warned:
+                self._warned = True
+                warn_of_no_plan(self.sparsity)
             for layer in network.layers:
                 if layer.moments_stale:  # a shared extractor may have moments in several
                     layer.settle_moments(self.optimizers)
@@ -274,17 +248,6 @@ class Controller:
             if network.optimizer is optimizer:
                 for layer in network.layers:
                     layer.remask()
-
-    def _warn_of_no_plan(self) -> None:
-        if self._warned:
-            return
-        self._warned = True
-        warnings.warn(
-            f"the policy trains at sparsity {self.sparsity:.3g}, denser than was asked for, and "
-            "nothing takes it further: pass SparsityCallback('prune') to learn(), or leave "
-            "initial_sparsity out to begin at the sparsity asked for",
-            stacklevel=2,
-        )
 
     def _update_if_due(self, network: SparseNetwork, plan: Plan) -> None:
         gradients = network.take_gradients(self._gradient_masks)
@@ -302,15 +265,7 @@ class Controller:
 
     def _saved_form(self, optimizer: th.optim.Optimizer, state_dict: dict[str, Any]) -> None:
         """State_dict hook: moments look the same whatever the storage."""
-        parameters = [p for group in optimizer.param_groups for p in group["params"]]
-        numbers = {id(parameter): number for number, parameter in enumerate(parameters)}
-        for layer in self.layers:
-            number = numbers.get(id(layer.weight))
-            if layer.compact and number in state_dict["state"]:
-                state_dict["state"][number] = {
-                    key: layer.saved_moment(value) if isinstance(value, th.Tensor) else value
-                    for key, value in state_dict["state"][number].items()
-                }
+        save_moments(optimizer, state_dict, self.layers)
 
     def _move(
         self, network: SparseNetwork, plan: Plan, gradients: dict[str, th.Tensor | None]

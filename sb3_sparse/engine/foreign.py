@@ -51,9 +51,9 @@ _changes = 0
 
 
 def watch(owner: Owner) -> None:
-    """Look after the layers of ``owner`` from now on; call again when they or its optimizers change.
+    """Look after the layers of ``owner`` from now on; it is held weakly.
 
-    The owner is held weakly.
+    Call again when its layers or optimizers are others.
     """
     global _changes
     if not _changes:
@@ -85,7 +85,7 @@ def _layers_of(optimizer: th.optim.Optimizer) -> Iterator[SparseLayer]:
             for owner in _owners
             if not any(optimizer is own for own in owner.optimizers)
             for layer in owner.layers
-            if id(layer.weight) in moved
+            if id(layer.module._parameters.get("weight")) in moved  # may be parametrized by now
         ]
         found = _found[optimizer] = _Found(_changes, parameters, layers)
     return (layer for reference in found.layers if (layer := reference()) is not None)

@@ -38,10 +38,18 @@ def find_kernels(
                 f'and Conv layers can); keep it dense with dense_layers=["{name}*"]'
             )
         if isinstance(module, KERNEL_TYPES):
-            if not isinstance(module.weight, nn.Parameter):
-                raise UnsupportedError(
-                    f"the weight of {name} is computed from other parameters (spectral_norm, "
-                    "weight_norm or another parametrization), so it cannot be masked; use a plain "
-                    f"{type(module).__name__}"
-                )
+            check_plain(module, name)
             yield name, module
+
+
+def check_plain(module: nn.Module, name: str) -> None:
+    """Refuse a layer whose weight is no Parameter of its own.
+
+    :raises UnsupportedError: if it is computed from others
+    """
+    if not isinstance(module._parameters.get("weight"), nn.Parameter):
+        raise UnsupportedError(
+            f"the weight of {name} is computed from other parameters (spectral_norm, weight_norm "
+            "or another parametrization), so it cannot be masked; use a plain "
+            f"{type(module).__name__.removeprefix('Parametrized')}"
+        )

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from torch import nn
 
 from sb3_sparse.engine.gradients import GradientMask
-from sb3_sparse.engine.kernels import Kernel
-from sb3_sparse.errors import TopologyError
+from sb3_sparse.engine.kernels import Kernel, check_plain
+from sb3_sparse.errors import TopologyError, UnsupportedError
 from sb3_sparse.topology import Exchange
 
 
@@ -39,8 +39,10 @@ class SparseLayer(ABC):
     @property
     def weight(self) -> nn.Parameter:
         """The parameter that the optimizer moves."""
-        weight = self.module.weight
-        assert isinstance(weight, nn.Parameter)
+        weight = self.module._parameters.get("weight")
+        if weight is None:
+            check_plain(self.module, self.name)
+        assert weight is not None
         return weight
 
     @property
@@ -196,3 +198,32 @@ def moments_of(
         for key, value in state.items()
         if isinstance(value, th.Tensor) and value.dim()
     ]
+
+
+def save_moments(
+    optimizer: th.optim.Optimizer, state_dict: dict[str, Any], layers: Iterable[SparseLayer]
+) -> None:
+    """Show moments of compact layers in an optimizer's state_dict as those of masked ones."""
+    parameters = [p for group in optimizer.param_groups for p in group["params"]]
+    numbers = {id(parameter): number for number, parameter in enumerate(parameters)}
+    for layer in layers:
+        number = numbers.get(id(layer.weight))
+        if layer.compact and number in state_dict["state"]:
+            state_dict["state"][number] = {
+                key: layer.saved_moment(value) if isinstance(value, th.Tensor) else value
+                for key, value in state_dict["state"][number].items()
+            }
+
+
+def check_masked(optimizer: th.optim.Optimizer, layers: Iterable[SparseLayer]) -> None:
+    """Refuse compact layers under an optimizer that does not move each weight by itself.
+
+    :raises UnsupportedError: if one is compact
+    """
+    compact = next((layer.name for layer in layers if layer.compact), None)
+    if compact is not None:
+        raise UnsupportedError(
+            f"{type(optimizer).__name__} does not move each weight by itself, as Adam does, so it "
+            f"cannot move layers that store active connections only ({compact}); make the policy "
+            "with compute='masked', or use another optimizer_class"
+        )

@@ -69,6 +69,14 @@ class CompactLinear(nn.Linear):
         module.take_saved(dense)
         return module
 
+    def expand(self) -> None:
+        """Become ``nn.Linear`` again, in place; the Parameter stays the same object."""
+        dense = self.dense()
+        self.__class__ = nn.Linear  # type: ignore[assignment]
+        for name in ("structure", "snapshot", "is_target", "listener"):
+            del vars(self)[name]
+        replace_data(self.weight, dense)
+
     def __getstate__(self) -> dict[str, Any]:
         # A copy's listener is put up when its own hooks are.
         return {**self.__dict__, "listener": None}
@@ -101,7 +109,7 @@ class CompactLinear(nn.Linear):
         if self.weight.dim() == 2:  # within :meth:`apply`, or while torch builds the layer
             super().reset_parameters()
         else:
-            self.apply(nn.Linear.reset_parameters)
+            self.apply(lambda _: nn.Linear.reset_parameters(self))
 
     def live(self) -> tuple[Structure, th.Tensor]:
         """The connections to compute with now, and their values."""

@@ -23,9 +23,7 @@ from sb3_sparse.engine.linear import MASK_KEY, check_mask
 FLOAT_MASK_KEY = "weight_mask_float"
 
 
-def _check_mask_key(
-    module: nn.Module, state_dict: dict[str, Any], prefix: str, *_: object
-) -> None:
+def _check_mask_key(module: nn.Module, state_dict: dict[str, Any], prefix: str, *_: object) -> None:
     """Pre-load hook of a layer."""
     if (mask := state_dict.get(prefix + MASK_KEY)) is not None:
         check_mask(mask, f"{prefix}weight")

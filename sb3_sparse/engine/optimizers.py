@@ -5,13 +5,13 @@ from __future__ import annotations
 import copy
 from collections import OrderedDict, defaultdict
 from collections.abc import Callable, Iterable, Mapping
-from numbers import Real
 from typing import Any
 
 import torch as th
 from torch import nn
 
 from sb3_sparse.errors import ConfigError
+from sb3_sparse.sparsity.numeric import is_number
 
 FUSED_BY_DEFAULT = (th.optim.Adam, th.optim.AdamW)
 
@@ -21,7 +21,7 @@ def check_weight_decay(weight_decay: float, optimizer_kwargs: Mapping[str, Any] 
 
     :raises ConfigError: if it is negative or no number, or if the optimizer was given one as well
     """
-    if isinstance(weight_decay, bool) or not isinstance(weight_decay, Real):
+    if not is_number(weight_decay):
         raise ConfigError(f"weight_decay must be a number, 0 or more, got {weight_decay!r}")
     if not 0.0 <= weight_decay < float("inf"):
         raise ConfigError(f"weight_decay must be 0 or more, got {weight_decay}")

@@ -6,7 +6,7 @@ from torch import nn
 
 from sb3_sparse.engine.linear import CompactLinear
 from sb3_sparse.engine.masked import MaskedLayer
-from sb3_sparse.engine.sequential import ChainedSequential
+from sb3_sparse.engine.sequential import ChainedSequential, unchain
 
 
 def make_plain(root: nn.Module) -> None:
@@ -16,14 +16,9 @@ def make_plain(root: nn.Module) -> None:
     """
     for module in root.modules():
         if isinstance(module, ChainedSequential):
-            module.__class__ = nn.Sequential  # type: ignore[assignment]
+            unchain(module)
         elif isinstance(module, CompactLinear):
-            dense = module.dense()
-            module.__class__ = nn.Linear  # type: ignore[assignment]
-            weight = nn.Parameter(dense, requires_grad=module.weight.requires_grad)
-            for name in ("structure", "snapshot", "is_target", "listener"):
-                del vars(module)[name]
-            module.weight = weight
+            module.expand()
         elif (layer := MaskedLayer.of(module)) is not None:
             layer.remask()
             layer.release()

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 
 from sb3_sparse.errors import ConfigError
+from sb3_sparse.sparsity.numeric import is_number, is_whole
 from sb3_sparse.sparsity.schedules import cosine_drop_fraction
 from sb3_sparse.topology import Moment, TopologyMethod, method_named
 
 UPDATE_ON = ("step", "rollout")
-
-
-def _number(value: object) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
 @dataclass(frozen=True)
@@ -38,14 +36,14 @@ class Plan:
 
     def __post_init__(self) -> None:
         method_named(self.method)
-        if type(self.update_interval) is not int or self.update_interval < 1:
+        if not is_whole(self.update_interval) or self.update_interval < 1:
             raise ConfigError(
                 "update_interval must be a whole number of gradient steps, 1 or more, "
                 f"got {self.update_interval!r}"
             )
-        if not _number(self.drop_fraction) or not 0.0 <= self.drop_fraction <= 1.0:
+        if not is_number(self.drop_fraction) or not 0.0 <= self.drop_fraction <= 1.0:
             raise ConfigError(f"drop_fraction must lie in [0, 1], got {self.drop_fraction!r}")
-        if not (_number(self.begin) and _number(self.end) and 0 <= self.begin < self.end <= 1):
+        if not (is_number(self.begin) and is_number(self.end) and 0 <= self.begin < self.end <= 1):
             raise ConfigError(
                 "begin and end are fractions of training with 0 <= begin < end <= 1, "
                 f"got begin={self.begin!r}, end={self.end!r}"
@@ -73,3 +71,16 @@ class Plan:
     def due(self, step: int, progress: float) -> bool:
         """Whether the schedule has an update at this gradient step."""
         return step % self.update_interval == 0 and self.begin <= progress < self.end
+
+
+def warn_of_no_plan(sparsity: float) -> None:
+    """Say that a policy that began denser than was asked for stays so.
+
+    :param sparsity: what it has now
+    """
+    warnings.warn(
+        f"the policy trains at sparsity {sparsity:.3g}, denser than was asked for, and nothing "
+        "takes it further: pass SparsityCallback('prune') to learn(), or leave initial_sparsity "
+        "out to begin at the sparsity asked for",
+        stacklevel=2,
+    )

@@ -97,10 +97,18 @@ def _steps(modules: Sequence[Any]) -> list[tuple[Any, bool, bool]]:
 
 
 def chain_up(root: nn.Module) -> None:
-    """Let every ``Sequential`` below ``root`` run its compact layers as chains."""
+    """Let every ``Sequential`` below ``root`` that has compact layers run them as chains."""
     for module in root.modules():
         if type(module) not in (nn.Sequential, ChainedSequential):
             continue
         if any(isinstance(child, CompactLinear) for child in module.children()):
             module.__class__ = ChainedSequential
             vars(module).update(_seen=(), _steps=[])  # more of them may be compact now
+        elif type(module) is ChainedSequential:
+            unchain(module)
+
+
+def unchain(module: ChainedSequential) -> None:
+    """Make it a plain ``Sequential`` again, in place."""
+    module.__class__ = nn.Sequential  # type: ignore[assignment]
+    del module._seen, module._steps

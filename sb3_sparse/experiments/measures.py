@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from sb3_sparse.errors import ConfigError
+from sb3_sparse.sparsity.numeric import is_number, is_whole
 
 DURING = {"snr": ("every", "batch_size"), "plasticity": ("every",)}
 AFTER = {"noise": ("sigmas", "n_episodes", "seeds")}
@@ -87,7 +88,7 @@ def _check(what: str, value: Any, several: bool) -> None:
     """Refuse what would fail after training only."""
     if several:
         numbers = value if isinstance(value, list) else []
-        if not numbers or not all(type(one) in (int, float) and one >= 0 for one in numbers):
+        if not numbers or not all(is_number(one) and one >= 0 for one in numbers):
             raise ConfigError(f"{what} must be a list of numbers, 0 or more, got {value!r}")
-    elif type(value) is not int or value < 1:
+    elif not is_whole(value) or value < 1:
         raise ConfigError(f"{what} must be a whole number, 1 or more, got {value!r}")

@@ -13,6 +13,7 @@ from typing import Any
 from sb3_sparse.errors import ConfigError, did_you_mean
 from sb3_sparse.experiments.cell import Cell
 from sb3_sparse.experiments.measures import Measures
+from sb3_sparse.sparsity.numeric import is_whole
 from sb3_sparse.topology import method_named, method_names
 from sb3_sparse.zoo.configs import read_yaml
 from sb3_sparse.zoo.environments import package_names
@@ -134,7 +135,7 @@ def _cells(
         raise ConfigError(f"runs must be a list of blocks, got {content['runs']!r}")
     scale = dict(of_scale)
     seeds = scale.pop(SEEDS, 1)
-    if isinstance(seeds, bool) or not isinstance(seeds, int) or seeds < 1:
+    if not is_whole(seeds) or seeds < 1:
         raise ConfigError(f"seeds must be a number, 1 or more, got {seeds!r}")
     measures = Measures.of(scale.pop(MEASURES, content.get(MEASURES, {})))
     schedule = scale.pop(SCHEDULE, {})

@@ -11,6 +11,7 @@ from stable_baselines3.common.preprocessing import is_image_space
 from torch import nn
 
 from sb3_sparse.errors import ConfigError
+from sb3_sparse.sparsity.numeric import is_whole
 
 
 def check_images(
@@ -31,7 +32,7 @@ def check_images(
             f"{observation_space}; vectors need no such extractor, and images in [0, 1] need "
             "normalize_images=False and features_extractor_kwargs=dict(normalized_image=True)"
         )
-    if len(channels) != 3 or any(type(count) is not int or count < 1 for count in channels):
+    if len(channels) != 3 or any(not is_whole(count) or count < 1 for count in channels):
         raise ConfigError(f"channels must be three whole numbers, 1 or more, got {channels!r}")
     return observation_space
 

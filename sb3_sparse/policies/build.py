@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
+import warnings
 from collections.abc import Callable, Iterable, Mapping
-from typing import TYPE_CHECKING
 
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
 from sb3_sparse.engine.kernels import KERNEL_TYPES, find_kernels
@@ -20,9 +23,7 @@ from sb3_sparse.policies.spec import (
     matches,
     output_layers,
 )
-
-if TYPE_CHECKING:
-    from stable_baselines3.common.policies import BasePolicy
+from sb3_sparse.policies.storage import KNOWN
 
 
 def build_networks(
@@ -61,6 +62,8 @@ def build_networks(
                 f"{name!r}"
             )
     sparsities = config.by_network(sizes)
+    if config.sparsity_aware_init and config.initial_sparsity != 0.0:
+        _warn_of_redrawn(policy, modules, networks)
     for network in networks:
         sparsity = sparsities[network.name]
         gains = {layer.name: gain(layer.name) for layer in network.layers}
@@ -73,6 +76,42 @@ def build_networks(
         )
     _add_targets(modules, specs, networks)
     return networks
+
+
+def _warn_of_redrawn(
+    policy: BasePolicy, modules: Mapping[str, nn.Module], networks: Iterable[SparseNetwork]
+) -> None:
+    """Say so if weights that a user's extractor came with, pretrained perhaps, are about to go.
+
+    Where SB3 has just drawn them itself (``ortho_init``), there is nothing left of them to lose.
+    """
+    if getattr(policy, "ortho_init", False):
+        return
+    own = [
+        f"{name}."
+        for name, module in modules.items()
+        if isinstance(module, BaseFeaturesExtractor)
+        and type(module).__module__.partition(".")[0] not in KNOWN
+    ]
+    lost = [
+        layer.name
+        for network in networks
+        for layer in network.layers
+        if layer.name.startswith(tuple(own)) and not _as_torch_draws(layer.weight)
+    ]
+    if lost:
+        warnings.warn(
+            f"the weights of {', '.join(lost)} are drawn anew, by the connections that are there, "
+            "though they are not as torch draws them. To keep weights of your own, pretrained ones "
+            "for instance, masked, give policy_kwargs=dict(sparsity_aware_init=False)",
+            stacklevel=2,
+        )
+
+
+def _as_torch_draws(weight: nn.Parameter) -> bool:
+    """Whether all weights lie within the bound of ``nn.Linear`` and ``nn.Conv2d`` by default."""
+    fan_in = weight[0].numel()
+    return bool(weight.detach().abs().max() <= 1.0001 / math.sqrt(fan_in))
 
 
 def _find_layers(
@@ -148,6 +187,13 @@ def _add_targets(
                 continue
             layer = layers.get(id(module.weight))
             target = modules[f"{spec.target}.{name}"]
+            if target is module:
+                raise UnsupportedError(
+                    f"{root}.{name} is one and the same module as {spec.target}.{name}, so the "
+                    "target would move with the network; build a new module each time the features "
+                    "extractor is made, or hand it in through features_extractor_kwargs, which are "
+                    "copied"
+                )
             if layer is None or id(target) in done:
                 continue
             assert isinstance(target, KERNEL_TYPES)

@@ -5,10 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from sb3_sparse.engine.native.library import library
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.sparsity.budgets import split_sparsity
 from sb3_sparse.sparsity.distributions import check_distribution, check_sparsity
+from sb3_sparse.sparsity.numeric import is_whole
 
 COMPUTE = ("masked", "sparse", "auto")
 SPARSITY_MISSING = (
@@ -35,7 +38,7 @@ class SparsityConfig:
     :param mask_seed: seed of masks and growth; None: read off torch's generator without advancing
         it, so that SB3's ``seed`` decides
     :param compute: ``"masked"``: dense weights and masks; ``"sparse"``: linear layers store and
-        compute their active connections only; ``"auto"``: whichever is quicker, layer by layer
+        compute their active connections only; ``"auto"``: large and sparse ones do
     :raises ConfigError: for a value that is not allowed
     :raises MissingKernels: for ``compute="sparse"`` without compiled kernels
     """
@@ -71,11 +74,11 @@ class SparsityConfig:
             raise ConfigError(
                 f'dense_layers must be a list of names, e.g. ["output"], got {self.dense_layers!r}'
             )
-        if not isinstance(self.sparsity_aware_init, bool):
+        if not isinstance(self.sparsity_aware_init, (bool, np.bool_)):
             raise ConfigError(
                 f"sparsity_aware_init must be true or false, got {self.sparsity_aware_init!r}"
             )
-        if self.mask_seed is not None and (type(self.mask_seed) is not int or self.mask_seed < 0):
+        if self.mask_seed is not None and (not is_whole(self.mask_seed) or self.mask_seed < 0):
             raise ConfigError(
                 f"mask_seed must be a whole number, 0 or more, got {self.mask_seed!r}"
             )
@@ -101,9 +104,9 @@ class SparsityConfig:
                     f"sparsity is given for {', '.join(repr(n) for n in self.sparsity)}; this "
                     f"policy has the networks {names}: name each of them, or give one number"
                 )
-            return {name: float(self.sparsity[name]) for name in sizes}
+            return {name: check_sparsity(self.sparsity[name]) for name in sizes}
         if self.actor_share is None:
-            return {name: float(self.sparsity) for name in sizes}
+            return {name: check_sparsity(self.sparsity) for name in sizes}
         if set(sizes) != {"actor", "critic"}:
             raise ConfigError(f"actor_share needs an actor and a critic; this policy has {names}")
         actor, critic = split_sparsity(
@@ -124,4 +127,4 @@ class SparsityConfig:
                 f"initial_sparsity={self.initial_sparsity} is above the sparsity {final} of "
                 f"{network!r}; pruning only removes, so start at or below it (0.0 is dense)"
             )
-        return float(self.initial_sparsity)
+        return check_sparsity(self.initial_sparsity)

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from functools import partial
+
+import torch as th
 from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, NatureCNN
+from stable_baselines3.common.type_aliases import Schedule
 
 from sb3_sparse.errors import MissingExtra
 from sb3_sparse.policies.critics import PassesGradientsOn, SparseCriticsMixin
@@ -12,6 +16,7 @@ from sb3_sparse.policies.sac import GAUSSIAN_ACTOR, TWIN_CRITIC
 from sb3_sparse.policies.spec import NetworkSpec
 
 try:
+    from sb3_contrib.common.torch_layers import BatchRenorm1d
     from sb3_contrib.crossq.policies import Actor as CrossQActor
     from sb3_contrib.crossq.policies import CrossQCritic, CrossQPolicy
     from sb3_contrib.qrdqn.policies import QRDQNPolicy, QuantileNetwork
@@ -69,6 +74,28 @@ SparseQRDQNCnnPolicy = with_extractor(SparseQRDQNPolicy, "Cnn", NatureCNN)
 SparseQRDQNMultiInputPolicy = with_extractor(SparseQRDQNPolicy, "MultiInput", CombinedExtractor)
 
 
+class SoundBatchRenorm1d(BatchRenorm1d):
+    """BatchRenorm that passes no NaN back to a unit that is constant over the batch.
+
+    Once its warm-up is over, sb3-contrib's takes the square root of the batch's variance, whose
+    derivative at 0 is infinite. Units without an input, which sparse layers have, are constant.
+    They get the gradient 0.
+    """
+
+    def forward(self, x: th.Tensor) -> th.Tensor:
+        """As in sb3-contrib, shape ``(batch, features)``."""
+        if self.training and x.requires_grad:
+            x = x.view_as(x)
+            constant = x.detach().var(dim=0) == 0
+            x.register_hook(partial(_zero_where, constant))  # type: ignore[no-untyped-call]
+        result: th.Tensor = super().forward(x)
+        return result
+
+
+def _zero_where(constant: th.Tensor, grad: th.Tensor) -> th.Tensor:
+    return grad.masked_fill(constant, 0.0)
+
+
 class SparseCrossQActor(SparsePart, CrossQActor):
     """Actor of CrossQ."""
 
@@ -88,6 +115,12 @@ class SparseCrossQPolicy(SparseCriticsMixin, CrossQPolicy):
             roots=("critic",), trunks=("critic.qf*",), heads=("critic.qf*",), owner="critic"
         ),
     }
+
+    def _build(self, lr_schedule: Schedule) -> None:
+        super()._build(lr_schedule)
+        for module in self.modules():
+            if type(module) is BatchRenorm1d:
+                module.__class__ = SoundBatchRenorm1d
 
 
 SparseCrossQMlpPolicy = with_extractor(SparseCrossQPolicy, "Mlp", FlattenExtractor)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
+import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.torch_layers import (
@@ -12,6 +14,7 @@ from stable_baselines3.common.torch_layers import (
     FlattenExtractor,
     NatureCNN,
 )
+from torch import nn
 
 from sb3_sparse.errors import UnsupportedError
 
@@ -35,3 +38,19 @@ def choose_extractor(
     if is_image_space(observation_space, normalized_image=not normalize_images):
         return NatureCNN
     return FlattenExtractor
+
+
+def copied_modules(value: Any, memo: dict[int, Any] | None = None) -> Any:
+    """The same value with copies of all modules and tensors in it, however nested; the rest stays.
+
+    :param value: keyword arguments, say
+    :param memo: what was copied already, so that what is shared stays shared
+    """
+    memo = {} if memo is None else memo
+    if isinstance(value, (nn.Module, th.Tensor)):
+        return copy.deepcopy(value, memo)
+    if type(value) is dict:
+        return {key: copied_modules(entry, memo) for key, entry in value.items()}
+    if type(value) in (list, tuple):
+        return type(value)(copied_modules(entry, memo) for entry in value)
+    return value

@@ -17,15 +17,17 @@ from sb3_sparse.engine.auto import AutoCompute
 from sb3_sparse.engine.controller import Controller
 from sb3_sparse.engine.linear import check_conversion
 from sb3_sparse.engine.optimizers import check_weight_decay, prefer_fused
-from sb3_sparse.errors import CorruptStateError
+from sb3_sparse.engine.places import check_places
+from sb3_sparse.errors import CorruptStateError, UnsupportedError
 from sb3_sparse.policies.build import build_networks
 from sb3_sparse.policies.compiled import names_in, plain_names
 from sb3_sparse.policies.config import SparsityConfig
-from sb3_sparse.policies.extractors import choose_extractor
+from sb3_sparse.policies.extractors import choose_extractor, copied_modules
 from sb3_sparse.policies.named import import_named
 from sb3_sparse.policies.parts import without_graphs
 from sb3_sparse.policies.report import SparsityReport, report_on
 from sb3_sparse.policies.spec import NetworkSpec
+from sb3_sparse.policies.storage import may_compact
 from sb3_sparse.policies.vectors import from_vector, to_vector
 
 Sparse = TypeVar("Sparse", bound="SparsePolicyMixin")
@@ -49,7 +51,8 @@ class SparsePolicyMixin(BasePolicy):
     :param mask_seed: seed of masks and growth; None: read off torch's generator without advancing
         it, so that SB3's ``seed`` decides
     :param compute: ``"masked"``: dense weights and masks; ``"sparse"``: linear layers store and
-        compute their active connections only; ``"auto"``: whichever is quicker, layer by layer
+        compute their active connections only; ``"auto"``: large and sparse ones do, by a rule of
+        shapes and counts (docs/compute.md)
     :param kwargs: SB3's own policy arguments; ``features_extractor_class``, ``optimizer_class`` and
         ``activation_fn`` may also be dotted paths, e.g. ``"torch.nn.ReLU"``
     :raises ConfigError: for a value that is not allowed
@@ -106,10 +109,18 @@ class SparsePolicyMixin(BasePolicy):
         networks = build_networks(self, self.networks, config, seed, self._initial_gain)
         for network in networks:
             prefer_fused(network.optimizer)
-        auto = AutoCompute() if compute == "auto" else None
-        self.sparse = Controller(networks, seed, self.functional_gradients, weight_decay, auto)
+        layers = [layer for network in networks for layer in network.layers]
+        allowed = may_compact(self, layers, asked_for=compute == "sparse")
+        self.sparse = Controller(
+            networks,
+            seed,
+            self.functional_gradients,
+            weight_decay,
+            AutoCompute(allowed) if compute == "auto" else None,
+        )
+        self.sparse.choose_storage(self)
         if compute == "sparse":
-            self.sparse.compact(self)
+            self.sparse.compact(self, allowed)
         if not all(layer.full and layer.final_nnz == layer.size for layer in self.sparse.layers):
             self._quicken()  # a policy without zeros stays stock SB3's to the bit
         self.sparse.attach()
@@ -125,12 +136,28 @@ class SparsePolicyMixin(BasePolicy):
     def _apply(self, fn: Any, recurse: bool = True) -> Any:
         sparse = vars(self).get("sparse")  # SB3 moves parts before the whole is there
         if sparse is not None and any(layer.compact for layer in sparse.layers):
-            check_conversion(fn)  # before anything has changed
+            try:
+                check_conversion(fn)  # before anything has changed
+            except UnsupportedError:
+                if self.sparsity_config.compute != "auto":
+                    raise
+                sparse.expand(self)  # to a GPU, say
         return super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)  # type: ignore[no-untyped-call]
         self.sparse.attach()  # a copy's hooks do not come along
+
+    def make_features_extractor(self) -> BaseFeaturesExtractor:
+        """As in SB3, with copies of modules in ``features_extractor_kwargs``: each extractor has
+        its own, and what the user handed in stays as it was.
+        """
+        given = self.features_extractor_kwargs
+        self.features_extractor_kwargs = copied_modules(given)
+        try:
+            return super().make_features_extractor()
+        finally:
+            self.features_extractor_kwargs = given
 
     def _quicken(self) -> None:
         """Replace what SB3 computes in more steps than it needs."""
@@ -144,14 +171,14 @@ class SparsePolicyMixin(BasePolicy):
 
         :raises UnsupportedError: if a sparse layer was replaced by another module
         """
-        self.sparse.check_places(self)
+        check_places(self, self.sparse.layers)
         self.sparse.enforce()
         return report_on(self)
 
     def set_training_mode(self, mode: bool) -> None:
         """As in SB3. Every ``train()`` calls it first: here a copied policy gets its hooks back."""
         super().set_training_mode(mode)
-        self.sparse.check_places(self)
+        check_places(self, self.sparse.layers)
         if mode:
             self.sparse.begin_training(self)
         else:
@@ -196,14 +223,14 @@ class SparsePolicyMixin(BasePolicy):
                 )
 
     def get_extra_state(self) -> th.Tensor:
-        """Mask seed, clock and number of mask updates of each network, minibatch size; int64.
+        """Mask seed, clock and number of mask updates of each network, and a 0; int64.
 
-        The last is what ``compute="auto"`` has seen, or 0.
+        Files of version 0.1.0 may have a minibatch size at the end, which no longer means anything.
         """
         numbers = [self.sparse.seed]
         for network in self.sparse.networks:
             numbers += [network.clock, network.mask_updates]
-        numbers.append(0 if self.sparse.auto is None else self.sparse.auto.batch)
+        numbers.append(0)
         return th.tensor(numbers, dtype=th.int64)
 
     def set_extra_state(self, state: th.Tensor) -> None:
@@ -223,12 +250,10 @@ class SparsePolicyMixin(BasePolicy):
                 f"updates of {', '.join(n.name for n in networks)}, batch), got {state!r}; the "
                 "file is damaged or belongs to a policy of another kind"
             )
-        seed, *numbers, batch = state.tolist()
+        seed, *numbers, _ = state.tolist()
         self.sparse.seed = int(seed)
         for network, clock, updates in zip(networks, numbers[::2], numbers[1::2], strict=True):
             network.clock, network.mask_updates = int(clock), int(updates)
-        if self.sparse.auto is not None and batch:
-            self.sparse.auto.batch = int(batch)  # a resumed run chooses at once
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()

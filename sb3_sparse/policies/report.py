@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +15,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
 from sb3_sparse.engine.kernels import Kernel
+from sb3_sparse.policies.spec import NetworkSpec
 
 if TYPE_CHECKING:
     from sb3_sparse.policies.mixin import SparsePolicyMixin
@@ -145,7 +147,37 @@ def report_on(policy: SparsePolicyMixin) -> SparsityReport:
                     in_budget=in_budget,
                 )
             )
-    return SparsityReport(tuple(layers))
+    return SparsityReport((*layers, *_other_matrices(policy, {r.name for r in layers})))
+
+
+def _other_matrices(policy: SparsePolicyMixin, names: set[str]) -> list[LayerReport]:
+    """Trained matrices that belong to no Linear or Conv layer, which are dense: embeddings, say.
+
+    A ``log_std`` is no connection, and targets do not count.
+
+    :param names: of the layers that are in the report already
+    """
+    specs: Mapping[str, NetworkSpec] = getattr(policy, "networks", {})
+    targets = tuple(f"{spec.target}." for spec in specs.values() if spec.target is not None)
+    found = []
+    for name, parameter in policy.named_parameters() if specs else ():
+        owner, _, own_name = name.rpartition(".")
+        if (
+            parameter.dim() < 2
+            or not parameter.requires_grad
+            or owner in names
+            or own_name == "log_std"
+            or name.startswith(targets)
+        ):
+            continue
+        within = [n for n, spec in specs.items() if name.startswith(spec.roots)]
+        size = parameter.numel()
+        found.append(
+            LayerReport(
+                (within or list(specs))[0], name, tuple(parameter.shape), size, size, 0, 0, False
+            )
+        )
+    return found
 
 
 def _activated(policy: nn.Module) -> set[int]:

@@ -52,7 +52,7 @@ def from_vector(root: nn.Module, vector: NDArray[Any]) -> None:
             "gives them, with 0 where a connection is inactive"
         )
     dropped = 0
-    for parameter, part in zip(parameters, values.split(sizes), strict=True):
+    for parameter, part in zip(parameters, th.split(values, sizes), strict=True):
         layer = layers.get(id(parameter))
         if layer is None:
             with th.no_grad():

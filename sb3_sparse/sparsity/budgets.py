@@ -6,6 +6,7 @@ import math
 
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.sparsity.distributions import check_sparsity
+from sb3_sparse.sparsity.numeric import is_number
 
 
 def default_actor_share(actor_size: int, critics_size: int) -> float:
@@ -50,7 +51,7 @@ def split_sparsity(
     Source: arXiv:2206.10369, figure on the actor-critic ratio.
     """
     sparsity = check_sparsity(sparsity)
-    if isinstance(actor_share, bool) or not isinstance(actor_share, (int, float)):
+    if not is_number(actor_share):
         raise ConfigError(f"actor_share must be a number in (0, 1), got {actor_share!r}")
     low, high = feasible_actor_share(actor_size, critics_size, sparsity)
     budget = (1.0 - sparsity) * (actor_size + critics_size)

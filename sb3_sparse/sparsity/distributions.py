@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from numbers import Real
 
 from sb3_sparse.errors import ConfigError, did_you_mean
+from sb3_sparse.sparsity.numeric import as_float, is_number
 
 Shape = Sequence[int]
 
@@ -27,13 +27,13 @@ def check_sparsity(sparsity: float, what: str = "sparsity") -> float:
 
     :raises ConfigError: unless it is a number in [0, 1)
     """
-    if isinstance(sparsity, bool) or not isinstance(sparsity, Real):
+    if not is_number(sparsity):
         raise ConfigError(f"{what} must be a number in [0, 1), got {sparsity!r}")
     if not 0.0 <= sparsity < 1.0:
         raise ConfigError(
             f"{what} must lie in [0, 1) (it is the removed fraction of connections), got {sparsity}"
         )
-    return float(sparsity)
+    return as_float(sparsity)
 
 
 def _uniform(shapes: Sequence[Shape], sparsity: float) -> list[float]:

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from math import prod
 from typing import Any
 
-from sb3_sparse.engine.native.library import why_missing
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.tuning.backend import optuna
 from sb3_sparse.tuning.objective import check_seeds, planned_evaluations
@@ -16,7 +15,6 @@ from sb3_sparse.tuning.spaces import Space, check_space, one_of_each, with_value
 from sb3_sparse.zoo.run import Run
 from sb3_sparse.zoo.settings import method_of, policy_kwargs_of
 
-SPARSE_FROM = 0.8
 DEFAULT_TRIALS = 100
 # What tuning itself chose, and what the config's file had: that is compared as settings.
 NOT_COMPARED = ("compute", "run.entry")
@@ -31,8 +29,7 @@ class Definition:
     :param seeds: runs a trial
     :param sampler: ``"grid"``, ``"tpe"`` or ``"random"``
     :param pruner: ``"none"``, ``"median"``, ``"halving"`` or ``"hyperband"``
-    :param compute: how trials store their layers, so that they can be repeated; None: as the run
-        says
+    :param compute: how trials store layers, in studies of version 0.1.0; None: as the run says
     :raises ConfigError: if these do not go together
     """
 
@@ -41,7 +38,7 @@ class Definition:
     seeds: int
     sampler: str
     pruner: str
-    compute: str | None
+    compute: str | None = None
 
     def __post_init__(self) -> None:
         check_seeds(self.seeds)
@@ -125,24 +122,6 @@ class Definition:
         run = Run(**values["run"])
         how = (values[name] for name in ("seeds", "sampler", "pruner", "compute"))
         return Definition(run, space, *how)
-
-
-def fixed_compute(run: Run) -> str | None:
-    """How the trials of a run shall store their layers, unless the run says it itself.
-
-    What ``compute="auto"`` chooses depends on what it measures, and a sum of other terms first
-    rounds otherwise. So: on non-zeros from 80 % sparsity on; masked below, in pruning (which begins
-    dense) and where there are no kernels.
-
-    :return: ``"sparse"``, ``"masked"``, or None where the run has a choice of its own
-    """
-    kwargs = policy_kwargs_of(run.settings())
-    if "compute" in kwargs:
-        return None
-    sparsity, begins = kwargs["sparsity"], kwargs.get("initial_sparsity")
-    shares = sparsity.values() if isinstance(sparsity, Mapping) else [sparsity]
-    sparse = min(shares) >= SPARSE_FROM and begins is None and why_missing() is None
-    return "sparse" if sparse else "masked"
 
 
 def differences(ours: Mapping[str, Any], theirs: Mapping[str, Any], path: str = "") -> list[str]:

@@ -8,6 +8,7 @@ from typing import Any
 
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.loading.text import read_text
+from sb3_sparse.sparsity.numeric import is_number, is_whole
 from sb3_sparse.tuning.backend import BaseDistribution, quiet_optuna
 from sb3_sparse.tuning.shipped import paper_space, wide_space
 from sb3_sparse.tuning.spaces import (
@@ -82,7 +83,7 @@ def _distribution(key: str, value: Any, name: str) -> BaseDistribution:
         if isinstance(value, (list, tuple)):
             return CategoricalDistribution(value)
         if isinstance(value, Mapping) and _is_range(value):
-            whole = all(type(value[end]) is int for end in ("low", "high"))
+            whole = all(is_whole(value[end]) for end in ("low", "high"))
             return IntDistribution(**value) if whole else FloatDistribution(**value)
     except (TypeError, ValueError) as error:
         raise ConfigError(f"{key} in {name}: {error}") from error
@@ -95,5 +96,5 @@ def _distribution(key: str, value: Any, name: str) -> BaseDistribution:
 
 def _is_range(value: Mapping[str, Any]) -> bool:
     ends = [value.get(end) for end in ("low", "high")]
-    numbers = all(isinstance(end, (int, float)) and not isinstance(end, bool) for end in ends)
+    numbers = all(is_number(end) for end in ends)
     return numbers and value.keys() <= {"low", "high", "log", "step"}

@@ -14,7 +14,7 @@ from sb3_sparse.errors import ConfigError, TuningFailed
 from sb3_sparse.launch import Launcher, Task, check_workers, launcher_named
 from sb3_sparse.tuning.backend import FrozenTrial, optuna, quiet_optuna
 from sb3_sparse.tuning.best import BEST, write_best
-from sb3_sparse.tuning.definition import Definition, fixed_compute
+from sb3_sparse.tuning.definition import Definition
 from sb3_sparse.tuning.spacefile import space_of
 from sb3_sparse.tuning.spaces import Space
 from sb3_sparse.tuning.storage import FOLDER, HEARTBEAT, JOURNAL, open_storage
@@ -182,7 +182,7 @@ def define(
     if pruner is None:
         pruner = "none" if sampler == "grid" else "median"
     run = replace(run, entry=run.config_entry())  # workers and reports need no file
-    return Definition(run, searched, seeds, sampler, pruner, fixed_compute(run))
+    return Definition(run, searched, seeds, sampler, pruner)
 
 
 def _tasks(

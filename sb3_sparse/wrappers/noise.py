@@ -12,6 +12,7 @@ from gymnasium.wrappers.utils import RunningMeanStd
 from numpy.typing import NDArray
 
 from sb3_sparse.errors import ConfigError
+from sb3_sparse.sparsity.numeric import is_number
 
 Array = NDArray[Any]
 
@@ -29,8 +30,7 @@ class Noise(gym.ObservationWrapper[Any, Any, Any], gym.utils.RecordConstructorAr
     def __init__(self, env: gym.Env[Any, Any], sigma: float, **arguments: Any) -> None:
         gym.utils.RecordConstructorArgs.__init__(self, sigma=sigma, **arguments)
         super().__init__(env)
-        number = isinstance(sigma, (int, float, np.number)) and not isinstance(sigma, bool)
-        if not number or not 0 <= sigma < np.inf:
+        if not is_number(sigma) or not 0 <= sigma < np.inf:
             raise ConfigError(f"sigma must be a number, 0 or more, got {sigma!r}")
         self.sigma = float(sigma)
         self.generator = np.random.default_rng()

@@ -16,6 +16,7 @@ from sb3_sparse.loading.text import read_text
 from sb3_sparse.loading.zips import look_into
 from sb3_sparse.loading.zooyaml import NotBuilt
 from sb3_sparse.policies.named import import_path
+from sb3_sparse.sparsity.numeric import is_whole
 from sb3_sparse.zoo.environments import import_packages, is_atari, known_environment
 from sb3_sparse.zoo.experiment import quiet
 from sb3_sparse.zoo.folder import CONFIG, RESTORE, arguments_of, params_of
@@ -42,7 +43,7 @@ def training_envs(saved: Saved, n_envs: int | None, seed: int) -> VecEnv:
         n_envs = look_into(saved.path).data.get("n_envs")
     if not 0 <= seed < 2**31:
         raise ConfigError(f"the seed must lie in [0, 2^31), got {seed}")
-    if type(n_envs) is not int or n_envs < 1:
+    if n_envs is None or not is_whole(n_envs) or n_envs < 1:
         raise ConfigError(f"n_envs must be 1 or more, got {n_envs!r}; give --n-envs")
     return envs_of(saved, n_envs, seed, training=True)
 

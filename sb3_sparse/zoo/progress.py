@@ -31,7 +31,6 @@ class TrainingProgress(BaseCallback):
     def __init__(self, console: Console) -> None:
         super().__init__()
         self.console = console
-        self._choice: object = None
         self.progress = Progress(
             BarColumn(bar_width=30),
             MofNCompleteColumn(),
@@ -44,6 +43,11 @@ class TrainingProgress(BaseCallback):
     def _on_training_start(self) -> None:
         self.planned = self.model._total_timesteps
         self.printed = 0
+        policy = self.model.policy
+        if isinstance(policy, SparsePolicyMixin):
+            compact = [layer.compact for layer in policy.sparse.layers]
+            if any(compact):
+                self.console.print(f"{sum(compact)} of {len(compact)} layers compute on non-zeros")
         self.task = self.progress.add_task("", total=self.planned, status=self._status())
         self.progress.start()
 
@@ -55,16 +59,7 @@ class TrainingProgress(BaseCallback):
             text += f", sparsity {policy.sparse.sparsity:.2%}"
         return text
 
-    def _say_what_was_chosen(self) -> None:
-        policy = unwrapped(self.model.policy)
-        if isinstance(policy, SparsePolicyMixin):
-            choice = policy.sparse.choice
-            if choice is not self._choice:
-                self.console.print(str(choice), soft_wrap=True)
-                self._choice = choice
-
     def _on_step(self) -> bool:
-        self._say_what_was_chosen()
         done = min(self.num_timesteps, self.planned)
         if self.n_calls % REFRESH_STEPS == 0 or done == self.planned:
             self.progress.update(self.task, completed=done, status=self._status())

@@ -1,41 +1,38 @@
 from __future__ import annotations
 
-import json
+import copy
 
+import numpy as np
 import pytest
 import torch as th
 from stable_baselines3 import SAC
-from stable_baselines3.common.logger import HumanOutputFormat, Logger
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from support import assert_masked, make
 from torch import nn
+from torch.nn import functional
 
 from sb3_sparse import SparsityCallback
-from sb3_sparse.engine import auto, timing
-from sb3_sparse.engine.auto import AutoCompute, choose, runs_of
-from sb3_sparse.engine.compact import CompactLayer
+from sb3_sparse.engine.auto import choose, runs_of
 from sb3_sparse.engine.masked import MaskedLayer
 from sb3_sparse.engine.native import library
-from sb3_sparse.engine.timing import Timing
+from sb3_sparse.errors import UnsupportedError
 
 
-def layers_of(root: nn.Module, sparsity: float = 0.5) -> list[MaskedLayer]:
+class All:
+    """A container of everything."""
+
+    def __contains__(self, name: object) -> bool:
+        return True
+
+
+def layers_of(root: nn.Module, density: float = 0.2) -> list[MaskedLayer]:
     layers = []
     for name, module in root.named_modules():
         if isinstance(module, (nn.Linear, nn.Conv2d)):
             layer = MaskedLayer(name, module)
-            mask = th.rand(layer.size, generator=th.Generator().manual_seed(0)) >= sparsity
-            layer.set_mask(mask.numpy())
+            layer.set_mask(np.arange(layer.size) < round(density * layer.size))
             layers.append(layer)
     return layers
-
-
-@pytest.fixture
-def timings(monkeypatch):
-    """Made-up timings by shape, in place of measured ones."""
-    known: dict[tuple[int, int], Timing] = {}
-    monkeypatch.setattr(auto, "timing_of", lambda shape, nnz, batch: known[shape])
-    known[1, 1] = Timing(0.0, 0.0, 0.0)
-    monkeypatch.setattr(auto, "WORTH_MEASURING", 1)
-    return known
 
 
 def test_runs_are_linear_layers_with_activations_between_them():
@@ -50,202 +47,178 @@ def test_runs_are_linear_layers_with_activations_between_them():
     assert names == [["2"], ["0.0", "0.2"], ["0.4"]]
 
 
-def test_each_layer_is_stored_as_is_quicker(timings):
-    # Kept apart by a LayerNorm: 1.0 or 0.4 + 0.1 there, 1.0 or 0.9 + 0.2 here.
-    root = nn.Sequential(nn.Linear(2, 3), nn.LayerNorm(3), nn.Linear(3, 4))
-    timings.update({(3, 2): Timing(1.0, 0.4, 0.1), (4, 3): Timing(1.0, 0.9, 0.2)})
-    choice = choose(root, layers_of(root), batch=8)
-    assert choice.compact == ("0",)
-    assert [layer.chosen_seconds for layer in choice.layers] == [pytest.approx(0.5), 1.0]
-    assert choice.speedup == pytest.approx(2.0 / 1.5)
+def test_a_run_computes_on_non_zeros_if_a_layer_in_it_is_large_and_sparse():
+    root = nn.Sequential(
+        nn.Linear(8, 256), nn.Tanh(), nn.Linear(256, 128), nn.LayerNorm(128), nn.Linear(128, 3)
+    )  # 256 x 128 = 32,768 = 2**15
+    assert choose(root, layers_of(root, 0.25), All()) == ["0", "2"]
+    assert choose(root, layers_of(root, 0.26), All()) == []
+    assert choose(root, layers_of(root, 0.25), {"0", "4"}) == []
+    root[2] = nn.Linear(256, 127)
+    assert choose(root, layers_of(root, 0.1), All()) == []
 
 
-def test_conversions_count_only_where_a_compact_layer_meets_something_else(timings):
-    # Alone, the middle one would lose (0.8 + 0.6 > 1); between compact ones it converts nothing.
-    root = nn.Sequential(nn.Linear(3, 3), nn.ReLU(), nn.Linear(3, 4), nn.Tanh(), nn.Linear(4, 4))
-    timings.update(
-        {(3, 3): Timing(1.0, 0.1, 0.6), (4, 3): Timing(1.0, 0.8, 0.6), (4, 4): Timing(1, 0.1, 0.6)}
-    )
-    choice = choose(root, layers_of(root), batch=8)
-    assert choice.compact == ("0", "2", "4")
-    assert sum(layer.chosen_seconds for layer in choice.layers) == pytest.approx(
-        0.1 + 0.8 + 0.1 + 0.6
-    )
-
-
-def test_layers_that_follow_each_other_share_the_cost_of_the_call(timings):
-    # The second alone takes 1.1 of masked, but 0.3 of that is the call that the first makes anyway.
-    root = nn.Sequential(nn.Linear(3, 3), nn.ReLU(), nn.Linear(3, 4))
-    timings.update({(3, 3): Timing(2.0, 0.5, 0.1), (4, 3): Timing(1.0, 1.1, 0.1)})
-    assert choose(root, layers_of(root), 8).compact == ("0",)
-    timings[1, 1] = Timing(0.0, 0.3, 0.0)
-    choice = choose(root, layers_of(root), 8)
-    assert choice.compact == ("0", "2")
-    total = sum(layer.chosen_seconds for layer in choice.layers)
-    assert total == pytest.approx(0.5 + 0.1 * 3 / 6 + (1.1 - 0.3) + 0.1 * 4 / 7)
-
-
-def test_a_run_that_gains_less_than_a_tenth_stays_masked(timings):
-    root = nn.Sequential(nn.Linear(2, 3))
-    timings[(3, 2)] = Timing(1.0, 0.85, 0.06)
-    assert choose(root, layers_of(root), 8).compact == ()
-    timings[(3, 2)] = Timing(1.0, 0.85, 0.04)
-    assert choose(root, layers_of(root), 8).compact == ("0",)
-
-
-@pytest.mark.parametrize(
-    ("sparsity", "shape", "reason"),
-    [(0.9, (50, 40), "no linear layer is sparse and has 32,768"), (0.0, (400, 400), "no linear")],
-)
-def test_small_and_full_layers_are_not_even_measured(sparsity, shape, reason, monkeypatch):
-    monkeypatch.setattr(auto, "timing_of", lambda *_: pytest.fail("measured"))
-    root = nn.Sequential(nn.Linear(*shape))
-    choice = choose(root, layers_of(root, sparsity), 8)
-    assert choice.reason is not None
-    assert str(choice).startswith(f"compute='auto' keeps masks: {reason}")
-    assert choice.speedup == 1.0
-
-
-def test_missing_kernels_keep_masks_and_say_why(monkeypatch, tmp_path):
+def test_missing_kernels_keep_masks(monkeypatch, tmp_path):
+    root = nn.Sequential(nn.Linear(400, 400))
+    assert choose(root, layers_of(root), All()) == ["0"]
     monkeypatch.setattr(library, "PATH", tmp_path / "none.so")
     library.library.cache_clear()
-    root = nn.Sequential(nn.Linear(400, 400))
-    reason = choose(root, layers_of(root), 8).reason
+    found = choose(root, layers_of(root), All())
     library.library.cache_clear()
-    assert reason is not None
-    assert "were not compiled when sb3-sparse was installed" in reason
+    assert found == []
 
 
-def test_timings_are_measured_once_and_remembered_in_a_file(monkeypatch, tmp_path):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(timing, "_known", {})
-    before = th.get_rng_state()
-    found = timing.timing_of((40, 30), 123, 70)
-    assert (th.get_rng_state() == before).all()
-    assert min(found.masked, found.compact) > 0
-    monkeypatch.setattr(timing, "_measure", lambda *_: pytest.fail("measured again"))
-    assert timing.timing_of((40, 30), 118, 70) is found  # two digits count: 120
-    monkeypatch.setattr(timing, "_known", {})
-    assert timing.timing_of((40, 30), 123, 70) == found
-    (key,) = json.loads(timing.cache_path().read_text())
-    assert key.endswith("|40|30|120|70")
-
-
-def test_a_damaged_cache_is_measured_anew(monkeypatch, tmp_path):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(timing, "_known", {})
-    timing.cache_path().parent.mkdir()
-    timing.cache_path().write_text("{half")
-    assert timing.timing_of((4, 3), 5, 7).masked > 0
-    assert len(json.loads(timing.cache_path().read_text())) == 1
-
-
-def test_without_a_home_timings_are_measured_all_the_same(monkeypatch):
-    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
-    monkeypatch.setattr(timing, "_known", {})
-
-    def nowhere() -> None:
-        raise RuntimeError("Could not determine home directory.")
-
-    monkeypatch.setattr(timing.Path, "home", nowhere)
-    assert timing.timing_of((4, 3), 5, 7).masked > 0
-
-
-def test_measuring_minds_no_default_of_torch(monkeypatch, tmp_path):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(timing, "_known", {})
-    th.set_default_dtype(th.float64)
-    try:
-        with th.inference_mode(), th.autocast("cpu", dtype=th.bfloat16), th.device("meta"):
-            found = timing.timing_of((300, 300), 900, 64)
-    finally:
-        th.set_default_dtype(th.float32)
-    assert found.masked > 1e-5
-
-
-def test_what_is_compact_stays_so_in_later_choices(timings):
-    root = nn.Sequential(nn.Linear(2, 3), nn.ReLU(), nn.Linear(3, 4))
-    layers = layers_of(root)
-    layers[0] = CompactLayer(layers[0])
-    timings.update({(3, 2): Timing(1.0, 2.0, 0.1), (4, 3): Timing(1.0, 0.2, 0.1)})
-    choice = choose(root, layers, 8)
-    assert choice.compact == ("0", "2")
-    timings[(4, 3)] = Timing(1.0, 2.0, 0.1)
-    assert choose(root, layers, 8).compact == ("0",)
-
-
-def test_masks_that_are_quicker_everywhere_are_said_so(timings):
-    root = nn.Sequential(nn.Linear(2, 3))
-    timings[(3, 2)] = Timing(0.001, 0.002, 0.001)
-    assert str(choose(root, layers_of(root), 8)) == (
-        "compute='auto' (batch 8): masks are quicker in all 1 layers measured (1.00 ms forward and "
-        "backward)"
-    )
-
-
-def model_on_auto(monkeypatch, quicker: bool, **policy_kwargs):
-    fake = Timing(1.0, 0.2 if quicker else 2.0, 0.1)
-    call = Timing(0.0, 0.0, 0.0)
-    monkeypatch.setattr(auto, "timing_of", lambda shape, *_: call if shape == (1, 1) else fake)
-    monkeypatch.setattr(auto, "WORTH_MEASURING", 200)
-    return SAC(
-        "SparsePolicy",
-        "Pendulum-v1",
-        learning_starts=20,
-        batch_size=48,
-        seed=0,
-        policy_kwargs=dict(sparsity=0.9, net_arch=[20, 20], **policy_kwargs),
-    )
+def large(name: str = "SAC", **policy_kwargs):
+    kwargs = dict(net_arch=[200, 200], compute="auto", **policy_kwargs)
+    return make(name, policy_kwargs=kwargs)
 
 
 def compact_names(model) -> list[str]:
     return [layer.name for layer in model.policy.sparse.layers if layer.compact]
 
 
-def test_training_begins_masked_and_changes_where_that_is_quicker(monkeypatch, tmp_path, capsys):
-    model = model_on_auto(monkeypatch, quicker=True)
-    model.set_logger(Logger(None, [HumanOutputFormat(str(tmp_path / "log"))]))
-    model.learn(21, callback=SparsityCallback("rigl", update_interval=2))
-    assert compact_names(model) == []
-    assert model.policy.sparse.auto.batch == 48
-    model.learn(30, callback=SparsityCallback("rigl", update_interval=2))
-    assert "critic.qf0.2" in compact_names(model)
-    assert "actor.mu" not in compact_names(model)  # alone and too small
+def test_storage_is_decided_when_the_policy_is_built_and_shapes_stay(tmp_path):
+    model = large()
+    names = compact_names(model)
+    assert names == [
+        f"{part}.{layer}"
+        for part, layers in (("actor.latent_pi", (0, 2)), ("critic.qf0", (0, 2, 4)),
+                             ("critic.qf1", (0, 2, 4)))
+        for layer in layers
+    ]  # fmt: skip
+    averaged = th.optim.swa_utils.AveragedModel(model.policy.critic)
+    shapes = [parameter.shape for parameter in model.policy.parameters()]
+    model.learn(40, callback=SparsityCallback("rigl", update_interval=4))
+    assert [parameter.shape for parameter in model.policy.parameters()] == shapes
+    averaged.update_parameters(model.policy.critic)
     model.save(tmp_path / "model")
-    resumed = SAC.load(tmp_path / "model", env=model.get_env())
-    assert compact_names(resumed) == []
-    resumed.policy.set_training_mode(True)
-    assert compact_names(resumed) == compact_names(model)
-    model.logger.dump()
-    text = (tmp_path / "log").read_text()
-    assert "compute='auto' (batch 48, " in text
-    assert "times faster" in text
-    assert "expected_speedup" in text
+    assert compact_names(SAC.load(tmp_path / "model")) == names
 
 
-def test_training_stays_masked_where_that_is_quicker(monkeypatch):
-    model = model_on_auto(monkeypatch, quicker=False).learn(30)
+def test_equal_seeds_give_equal_runs_bit_for_bit_by_default():
+    models = [large().learn(40, callback=SparsityCallback("rigl", update_interval=4))
+              for _ in range(2)]  # fmt: skip
+    for one, other in zip(*(m.policy.parameters() for m in models), strict=True):
+        assert th.equal(one, other)
+
+
+def test_a_policy_that_is_pruned_becomes_compact_once_it_is_sparse_enough():
+    model = large(initial_sparsity=0.0)
     assert compact_names(model) == []
-    assert model.policy.sparse.auto.choice.speedup == 1.0
-
-
-def test_pruning_chooses_again_when_half_is_gone(monkeypatch):
-    model = model_on_auto(monkeypatch, quicker=True, initial_sparsity=0.0)
-    callback = SparsityCallback("prune", update_interval=1, begin=0.3, end=0.9)
-    choices = []
-    choose_again = AutoCompute.choose
-
-    def spied(self, root, layers):
-        choice = choose_again(self, root, layers)
-        if choice is not None:
-            choices.append((sum(layer.nnz for layer in layers), choice.compact))
-        return choice
-
-    monkeypatch.setattr(AutoCompute, "choose", spied)
-    model.learn(100, callback=callback)
-    whole = sum(layer.size for layer in model.policy.sparse.layers)
-    assert choices[0] == (whole, ())
-    assert len(choices) > 2
-    assert all(2 * b <= a for (a, _), (b, _) in zip(choices, choices[1:], strict=False))
-    assert choices[1][1] != ()
+    model.learn(60, callback=SparsityCallback("prune", update_interval=1, begin=0.4, end=0.9))
     assert "critic.qf1.2" in compact_names(model)
+    assert_masked(model)
+
+
+@pytest.mark.parametrize("where", [th.float64, "meta"])
+def test_a_policy_that_leaves_float32_on_the_cpu_goes_back_to_masks(where):
+    model = large()
+    before = {key: value.clone() for key, value in model.policy.state_dict().items()}
+    model.learn(25, callback=SparsityCallback("set", update_interval=2))
+    model.policy.load_state_dict(before)
+    model.policy.to(where)
+    assert compact_names(model) == []
+    if where == "meta":
+        return
+    for key, value in model.policy.state_dict().items():
+        np.testing.assert_array_equal(value, before[key], err_msg=key)
+    twin = copy.deepcopy(model.policy)
+    x = th.zeros(3, 3, dtype=th.float64)
+    assert th.equal(model.policy.actor.latent_pi(x), twin.actor.latent_pi(x))
+    model.policy.to(th.float32)
+    model.learn(30, callback=SparsityCallback("set", update_interval=2))
+    assert compact_names(model) == []
+    assert_masked(model)
+
+
+def test_moments_and_targets_survive_the_way_back_to_masks():
+    model = large().learn(30, callback=SparsityCallback("set", update_interval=2))
+    moments = model.critic.optimizer.state_dict()
+    target = {k: v.clone() for k, v in model.critic_target.state_dict().items()}
+    model.policy.sparse.expand(model.policy)
+    for key, value in model.critic_target.state_dict().items():
+        assert th.equal(value, target[key])
+    for number, state in model.critic.optimizer.state_dict()["state"].items():
+        for key, value in state.items():
+            assert th.equal(value, moments["state"][number][key]), (number, key)
+    model.learn(30, callback=SparsityCallback("set", update_interval=2))
+    assert_masked(model)
+
+
+class Tied(BaseFeaturesExtractor):
+    """Two layers, the second of which is the first transposed."""
+
+    def __init__(self, space):
+        super().__init__(space, 200)
+        self.first = nn.Linear(space.shape[0], 200)
+        self.second = nn.Linear(200, 200)
+
+    def forward(self, x):
+        h = self.second(self.first(x).relu())
+        return functional.linear(h, self.second.weight.t()).relu()
+
+
+class Attentive(BaseFeaturesExtractor):
+    """torch's transformer layer, which reads its layers' weights in evaluation mode."""
+
+    def __init__(self, space):
+        super().__init__(space, 64)
+        self.embed = nn.Linear(space.shape[0], 64)
+        self.layer = nn.TransformerEncoderLayer(64, 2, 1024, batch_first=True, dropout=0.0)
+
+    def forward(self, x):
+        return self.layer(self.embed(x).unsqueeze(1)).squeeze(1)
+
+
+class Shared(BaseFeaturesExtractor):
+    """One Parameter in two layers."""
+
+    def __init__(self, space):
+        super().__init__(space, 200)
+        self.layers = nn.Sequential(
+            nn.Linear(space.shape[0], 200), nn.ReLU(), nn.Linear(200, 200), nn.Linear(200, 200)
+        )
+        self.layers[3].weight = self.layers[2].weight
+
+    def forward(self, x):
+        return self.layers(x)
+
+
+DENSE = {Attentive: ["*.self_attn"]}
+
+
+@pytest.mark.parametrize("extractor", [Tied, Attentive, Shared])
+@pytest.mark.parametrize("name", ["SAC", "DQN", "PPO"])
+def test_weights_that_are_read_otherwise_than_by_their_layer_stay_matrices(name, extractor):
+    model = large(name, features_extractor_class=extractor, dense_layers=DENSE.get(extractor, []))
+    model.learn(50, callback=SparsityCallback("set", update_interval=4))
+    model.predict(model.observation_space.sample())
+    names = compact_names(model)
+    assert names
+    assert not any("features_extractor" in name for name in names)
+    assert_masked(model)
+
+
+@pytest.mark.parametrize("extractor", [Attentive, Shared])
+def test_sparse_compacts_what_the_user_calls_and_never_what_torch_reads(extractor):
+    model = make(
+        "PPO",
+        policy_kwargs=dict(
+            compute="sparse",
+            features_extractor_class=extractor,
+            dense_layers=DENSE.get(extractor, []),
+        ),
+    )
+    names = compact_names(model)
+    inner = "embed" if extractor is Attentive else "layers.0"
+    assert f"features_extractor.{inner}" in names or f"pi_features_extractor.{inner}" in names
+    assert not any("linear1" in name or name.endswith(("layers.2", "layers.3")) for name in names)
+    model.learn(64)
+    model.predict(model.observation_space.sample())
+
+
+def test_only_the_user_can_undo_sparse():
+    model = make("SAC", policy_kwargs=dict(compute="sparse"))
+    with pytest.raises(UnsupportedError, match="make the policy with compute='masked'"):
+        model.policy.double()
+    assert compact_names(model)

@@ -54,7 +54,6 @@ def test_sparse_without_kernels_is_an_error_and_auto_trains_with_masks(relocated
         make("SAC", policy_kwargs=dict(compute="sparse"))
     model = make("SAC", policy_kwargs=dict(compute="auto", net_arch=[200, 200])).learn(23)
     assert not any(layer.compact for layer in model.policy.sparse.layers)
-    assert "were not compiled" in str(model.policy.sparse.auto.choice)
 
 
 def test_a_damaged_library_does_not_load(relocated):

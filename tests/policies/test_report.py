@@ -5,8 +5,11 @@ from __future__ import annotations
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from support import make
+from torch import nn
 
 
 class Frames(gym.Env):
@@ -71,3 +74,31 @@ def test_a_report_leaves_the_policy_as_it_was():
     model.policy.sparsity_report()
     assert [module.training for module in model.policy.modules()] == modes
     assert not any(module._forward_hooks for module in model.policy.modules())
+
+
+class Embedded(BaseFeaturesExtractor):
+    """An embedding, attention and a matrix of its own beside a linear layer."""
+
+    def __init__(self, space):
+        super().__init__(space, 8)
+        self.words = nn.Embedding(5, 6)
+        self.first = nn.Linear(space.shape[0], 8)
+        self.mixing = nn.Parameter(th.eye(8))
+
+    def forward(self, x):
+        words = self.words((x[:, :1].abs() * 4).long().clamp(0, 4)).mean(dim=(1, 2))
+        return (self.first(x) + words[:, None]) @ self.mixing
+
+
+@pytest.mark.parametrize("name", ["SAC", "DQN", "PPO"])
+def test_matrices_that_are_no_layers_are_listed_as_dense(name):
+    model = make(name, policy_kwargs=dict(features_extractor_class=Embedded))
+    report = model.policy.sparsity_report()
+    others = {r.name.split(".")[-2] + "." + r.name.split(".")[-1]: r for r in report.layers
+              if not r.in_budget}  # fmt: skip
+    assert others["words.weight"].shape == (5, 6)
+    assert others["words.weight"].nnz == others["words.weight"].parameters == 30
+    assert others["features_extractor.mixing"].nnz == 64
+    assert not any("target" in r.name for r in report.layers)
+    assert "words.weight" in str(report)
+    assert abs(report.sparsity() - 0.9) < 0.01

@@ -9,7 +9,7 @@ from tuning_support import choices, small_run
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.tuning import Space, paper_space, space_of
 from sb3_sparse.tuning.backend import optuna
-from sb3_sparse.tuning.definition import Definition, fixed_compute
+from sb3_sparse.tuning.definition import Definition
 from sb3_sparse.tuning.spaces import check_space
 from sb3_sparse.zoo.run import Run
 
@@ -234,27 +234,6 @@ def test_how_many_trials_unless_one_says_so():
     assert definition().trials(None) == 200
     assert definition().trials(7) == 7
     assert definition(ranges(), sampler="tpe").trials(None) == 100
-
-
-@pytest.mark.parametrize(
-    ("changes", "compute"),
-    [
-        (dict(sparsity=0.8), "sparse"),
-        (dict(sparsity=0.79), "masked"),
-        (dict(method="dense"), "masked"),
-        (dict(method="prune", sparsity=0.95), "masked"),
-        (dict(sparsity=0.9, hyperparams={"compute": "auto"}), None),
-        (dict(algo="sac", env_id="Pendulum-v1",
-              hyperparams={"sparsity": {"actor": 0.9, "critic": 0.5}}), "masked"),
-    ],
-)  # fmt: skip
-def test_trials_store_layers_in_one_way_so_that_they_are_repeatable(changes, compute):
-    assert fixed_compute(Run(**changes)) == compute
-
-
-def test_a_machine_without_kernels_masks(monkeypatch):
-    monkeypatch.setattr("sb3_sparse.tuning.definition.why_missing", lambda: "no compiler")
-    assert fixed_compute(Run(sparsity=0.95)) == "masked"
 
 
 @pytest.mark.parametrize(

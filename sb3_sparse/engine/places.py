@@ -1,0 +1,37 @@
+"""Whether sparse layers are still where they were found."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from torch import nn
+
+from sb3_sparse.engine.layers import SparseLayer
+from sb3_sparse.errors import UnsupportedError
+
+
+def check_places(root: nn.Module, layers: Iterable[SparseLayer]) -> None:
+    """Refuse a policy in which a sparse layer was replaced by another module.
+
+    :param root: the policy
+    :param layers: its sparse layers
+    :raises UnsupportedError: if one was
+    """
+    for layer in layers:
+        if _module_at(root, layer.name) is not layer.module:
+            raise UnsupportedError(
+                f"{layer.name} was replaced after the policy had been made, so the new module is "
+                "neither sparse nor counted; copy new weights into the layer that is there "
+                "(load_state_dict, copy_), or make a policy that has the new layer from the "
+                "beginning (net_arch, features_extractor_class or a subclass)"
+            )
+
+
+def _module_at(root: nn.Module, name: str) -> nn.Module | None:
+    """What stands at a dotted name, also within modules that ``torch.compile`` has wrapped."""
+    module: nn.Module | None = root
+    for part in name.split("."):
+        module = None if module is None else module._modules.get(part)
+        if module is not None and "_orig_mod" in module._modules:
+            module = module._modules["_orig_mod"]
+    return module
