@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterable
 from difflib import get_close_matches
 
@@ -15,6 +16,11 @@ def did_you_mean(name: object, known: Iterable[str]) -> str:
     by_spelling = {one.lower(): one for one in known}
     close = get_close_matches(str(name).lower(), by_spelling, n=1)
     return f" (did you mean {by_spelling[close[0]]!r}?)" if close else ""
+
+
+def command(*words: object) -> str:
+    """A command of this package, as a shell takes it: names with spaces are quoted."""
+    return shlex.join(["sb3-sparse", *map(str, words)])
 
 
 class SparsityError(Exception):
@@ -31,6 +37,10 @@ class RunBusy(ConfigError):
 
 class TuningFailed(SparsityError, RuntimeError):
     """No trial of a study came to its end."""
+
+
+class Unwritable(SparsityError, OSError):
+    """A disk is full, or a folder cannot be written to."""
 
 
 class UnsupportedError(SparsityError, TypeError):

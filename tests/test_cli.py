@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -33,7 +34,11 @@ def test_train_says_what_it_does_and_enjoy_and_inspect_read_it(tmp_path):
     assert done.returncode == 0, done.stderr
     assert "Training DQN on CartPole-v1, rigl at 90% (ERK), seed 3" in done.stdout
     assert re.search(r"1500 of 1500 steps, return \d+\.\d, sparsity 8\d\.\d\d%", done.stdout)
-    assert "Return over 20 episodes:" in done.stdout
+    for step in (500, 1000, 1500):  # each evaluation is a line, also without a terminal
+        line = rf"^evaluated at step {step}: return \d+\.\d ± \d+\.\d, best so far \d+\.\d$"
+        assert re.search(line, done.stdout, re.MULTILINE)
+    assert "Evaluating the last policy: 2 episodes" in done.stdout
+    assert "Return over 2 episodes:" in done.stdout
     folder = Path("logs") / "dqn" / "CartPole-v1_1"
     for what, name in (("Last policy", "CartPole-v1.zip"), ("Best policy", "best_model.zip")):
         score = r":\s+\d+\.\d ± \d+\.\d  "
@@ -114,12 +119,24 @@ def test_a_run_that_is_asked_to_stop_says_how_to_go_on(tmp_path):
 
 def test_options_and_a_second_run_beside_the_first(tmp_path):
     args = ["--algo", "ppo", "--env", "CartPole-v1", "--method", "prune", "--sparsity", "0.8"]
-    args += ["--distribution", "uniform", "-n", "600", "--log-folder", "elsewhere", "--n-envs", "2"]
+    args += [
+        "--distribution",
+        "uniform",
+        "-n",
+        "600",
+        "--log-folder",
+        "else where",
+        "--n-envs",
+        "2",
+    ]
     for number in (1, 2):
         done = sb3_sparse("train", *args, cwd=tmp_path)
         assert done.returncode == 0, done.stderr
-        path = tmp_path / "elsewhere" / "ppo" / f"CartPole-v1_{number}" / "CartPole-v1.zip"
+        path = tmp_path / "else where" / "ppo" / f"CartPole-v1_{number}" / "CartPole-v1.zip"
         model = PPO.load(path)
+        last = done.stdout.splitlines()[-1]
+        assert shlex.split(last)[:2] == ["sb3-sparse", "inspect"]
+        assert shlex.split(last)[2].startswith(f"else where/ppo/CartPole-v1_{number}/")
     assert model.n_envs == 2
     for layer in model.policy.sparse.layers:
         assert layer.nnz == layer.size - int(0.8 * layer.size + 1e-6)

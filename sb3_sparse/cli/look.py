@@ -33,23 +33,30 @@ def enjoy(
 ) -> None:
     """Evaluate a saved policy, and record a video of it."""
     from sb3_sparse.zoo.enjoy import enjoy as score_run
+    from sb3_sparse.zoo.progress import EpisodesProgress
 
-    score = score_run(
-        model,
-        episodes,
-        best,
-        video,
-        seed,
-        gym_packages or [],
-        algo=algo,
-        env_id=env,
-        vecnormalize=vecnormalize,
-    )
+    progress = EpisodesProgress(console)
+    what = "Filming" if video else "Playing"
+    try:
+        score = score_run(
+            model,
+            episodes,
+            best,
+            video,
+            seed,
+            gym_packages or [],
+            algo=algo,
+            env_id=env,
+            vecnormalize=vecnormalize,
+            on_episode=lambda done: progress(what, done, episodes),
+        )
+    finally:
+        progress.close()
     console.print(f"Return over {score.episodes} episodes:")
-    what = "Best policy:" if score.model.name == "best_model.zip" else "Last policy:"
+    whose = "Best policy:" if score.model.name == "best_model.zip" else "Last policy:"
     if not model.is_dir():
-        what = "Policy:"
-    print_score(what, score.mean_return, score.std_return, score.model)
+        whose = "Policy:"
+    print_score(whose, score.mean_return, score.std_return, score.model)
     for path in score.videos:
         console.print(f"Video: {path}", soft_wrap=True)
 

@@ -28,10 +28,12 @@ from sb3_sparse.cli.common import (
     text,
     values_and_packages,
 )
-from sb3_sparse.errors import ConfigError
+from sb3_sparse.errors import ConfigError, command
 from sb3_sparse.zoo.progress import TrainingProgress
 from sb3_sparse.zoo.run import Run
 from sb3_sparse.zoo.settings import method_of, parse_overrides
+
+SHORT = 1e-3  # what a sparsity may miss by rounding
 
 
 def train(
@@ -72,7 +74,7 @@ def train(
         if resume is not None:
             _refuse_other_options(context)
             console.print(f"Going on with {resume}", soft_wrap=True)
-            outcome = engine.resume(resume, [progress])
+            outcome = engine.resume(resume, watch=progress)
         else:
             values, packages = values_and_packages(context.args, hyperparams, gym_packages)
             run = Run(
@@ -93,30 +95,38 @@ def train(
                 gym_packages=tuple(packages),
             )
             console.print(_headline(run))
-            outcome = engine.train(run, log_folder, [progress], tensorboard_log)
+            outcome = engine.train(run, log_folder, tensorboard_log=tensorboard_log, watch=progress)
     except KeyboardInterrupt:
-        console.print(
-            "Interrupted. A run that had begun goes on with sb3-sparse train --resume ITS_FOLDER"
-        )
+        progress.close()
+        if progress.folder is None:
+            console.print("Interrupted before the run had begun; nothing is left of it.")
+        else:
+            console.print("Interrupted. Go on from the last evaluation with:")
+            console.print(command("train", "--resume", progress.folder), soft_wrap=True)
         raise typer.Exit(INTERRUPTED) from None
     finally:
         progress.close()
     if not outcome.finished:
         steps = outcome.model.num_timesteps
         console.print(f"Stopped after {steps} steps. Go on with:", soft_wrap=True)
-        console.print(f"sb3-sparse train --resume {outcome.folder}", soft_wrap=True)
+        console.print(command("train", "--resume", outcome.folder), soft_wrap=True)
         raise typer.Exit(INTERRUPTED)
     results = outcome.results
-    reached = engine.reached_sparsity(outcome.model)
-    console.print(f"Sparsity {reached:.2%}. Return over {results[0].episodes} episodes:")
+    console.print(f"Sparsity {outcome.sparsity:.2%}. Return over {results[0].episodes} episodes:")
     for result in results:
         print_score(f"{result.what}:", result.mean_return, result.std_return, result.path)
-    best = " --best" if len(results) > 1 else ""
+    if outcome.sparsity < outcome.wanted_sparsity - SHORT:
+        console.print(
+            f"It was to reach {outcome.wanted_sparsity:.2%}: too few mask updates were due. Train "
+            "longer, or with a smaller update_interval; reports leave this run out.",
+            soft_wrap=True,
+        )
+    best = ["--best"] if len(results) > 1 else []
     console.print(
         "The best policy was chosen by other episodes. Look at it:" if best else "Look at it:"
     )
-    for command in (f"enjoy {outcome.folder}{best}", f"inspect {results[-1].path}"):
-        console.print(f"sb3-sparse {command}", soft_wrap=True)
+    for words in (["enjoy", outcome.folder, *best], ["inspect", results[-1].path]):
+        console.print(command(*words), soft_wrap=True)
 
 
 def _headline(run: Run) -> str:

@@ -101,8 +101,8 @@ def tune(
     definition = define(run, space, seeds, sampler, pruner, log_folder)
     name = definition.default_name if name is None else _checked(name)
     number = definition.trials(trials)
-    storage = storage or log_folder.absolute() / FOLDER / JOURNAL
-    folder = log_folder.absolute() / FOLDER / folder_name(name)
+    storage = storage or log_folder / FOLDER / JOURNAL
+    folder = log_folder / FOLDER / folder_name(name)
     opened = open_storage(storage, heartbeat)
     errors: dict[str, str] = {}
     with _in_reach(storage):
@@ -190,6 +190,7 @@ def _tasks(
 ) -> list[Task]:
     if is_journal(storage):
         storage = str(Path(storage).absolute())
+    folder = folder.absolute()
     arguments: dict[str, Any] = {
         "storage": storage,
         "name": name,

@@ -17,6 +17,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_sparse.errors import RunBusy
+from sb3_sparse.zoo.disk import writing
 from sb3_sparse.zoo.divergence import check_networks
 from sb3_sparse.zoo.evaluation import Evaluation
 from sb3_sparse.zoo.record import write_record
@@ -81,6 +82,20 @@ class Checkpoints(BaseCallback):
             return
         new = self.parent_folder / "unfinished"
         shutil.rmtree(new, ignore_errors=True)
+        try:
+            self._write(new, final)
+        except Exception:  # a full disk, which has room again for the record that says so
+            shutil.rmtree(new, ignore_errors=True)
+            raise
+        new.rename(final)
+        _to_disk(self.parent_folder)
+        write_record(self.parent_folder.parent, num_timesteps=self.model.num_timesteps)
+        for other in self.parent_folder.iterdir():
+            if other != final:
+                shutil.rmtree(other)
+
+    def _write(self, new: Path, final: Path) -> None:
+        """Write everything into a folder that will have another name."""
         (new / self.env_name).mkdir(parents=True)
         self.model.save(new / f"{self.env_name}.zip")
         if self.buffer is not None:
@@ -94,12 +109,6 @@ class Checkpoints(BaseCallback):
         for path in self.parent_folder.parent.glob(f"*{MONITOR}"):
             shutil.copy(path, new / path.name)
         _to_disk(*new.rglob("*"), new)
-        new.rename(final)
-        _to_disk(self.parent_folder)
-        write_record(self.parent_folder.parent, num_timesteps=self.model.num_timesteps)
-        for other in self.parent_folder.iterdir():
-            if other != final:
-                shutil.rmtree(other)
 
     @contextmanager
     def on_signals(self) -> Iterator[None]:
@@ -185,10 +194,12 @@ def locked(folder: Path) -> Iterator[None]:
     """Within it, no other process trains the run.
 
     :raises RunBusy: if one does already
+    :raises Unwritable: if the folder cannot be written to
     """
     lock = FileLock(folder / LOCK)
     try:
-        lock.acquire(timeout=PATIENCE)
+        with writing(folder, "free space or make it writable, and give the command again"):
+            lock.acquire(timeout=PATIENCE)
     except Timeout as error:
         raise RunBusy(f"another process is at work in {folder}") from error
     try:

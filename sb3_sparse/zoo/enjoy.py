@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.util
 import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +19,7 @@ from sb3_sparse.errors import ConfigError, MissingExtra
 from sb3_sparse.zoo.experiment import quiet
 from sb3_sparse.zoo.finetune import environment_of, envs_of, evaluated_deterministically
 from sb3_sparse.zoo.saved import Saved, find_saved
+from sb3_sparse.zoo.watch import counting
 
 VIDEO_STEPS = 1000
 
@@ -52,6 +53,7 @@ def enjoy(
     algo: str | None = None,
     env_id: str | None = None,
     vecnormalize: Path | None = None,
+    on_episode: Callable[[int], None] = lambda done: None,
 ) -> Score:
     """Evaluate a saved policy, deterministically (but for Atari games), as rl-zoo does.
 
@@ -64,6 +66,7 @@ def enjoy(
     :param algo: None: as the run's folder or the file says
     :param env_id: None: as the run's folder says
     :param vecnormalize: statistics of a VecNormalize; None: those in the run's folder
+    :param on_episode: is told how many episodes are over, at the start and after each
     :raises ConfigError: if there is no model, or what belongs to it is missing
     :raises CorruptStateError: if a file is damaged
     :raises Diverged: if the network is not finite
@@ -100,9 +103,15 @@ def enjoy(
                     name_prefix=saved.path.stem,
                 )
             deterministic = evaluated_deterministically(saved)
+            on_episode(0)
             mean, std = evaluate_policy(
-                model, env, n_eval_episodes=episodes, deterministic=deterministic
+                model,
+                env,
+                n_eval_episodes=episodes,
+                deterministic=deterministic,
+                callback=counting(on_episode),
             )
+            on_episode(episodes)
     finally:
         with quiet():
             env.close()

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from zipfile import ZipFile
@@ -20,10 +22,12 @@ from sb3_sparse.loading.zips import read_model
 from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.policies.mixin import SparsePolicyMixin
 from sb3_sparse.zoo.divergence import check_networks, check_return
+from sb3_sparse.zoo.watch import Watch
 
 NPZ = "evaluations.npz"
 BEST = "best_model.zip"
 STATE = "evaluation.json"
+UNFINISHED = "unfinished"
 CURE = (
     "nothing was changed. Restore it from a copy, or train anew: the run keeps its best model and "
     "evaluations"
@@ -91,6 +95,7 @@ class Evaluation(EvalCallback):
     :param episodes: episodes of one evaluation
     :param deterministic: whether the policy acts deterministically
     :param on_new_best: called when there is a new best model
+    :param watch: is told of each evaluation
     :param after_each: called after each evaluation
     """
 
@@ -102,6 +107,7 @@ class Evaluation(EvalCallback):
         episodes: int,
         deterministic: bool,
         on_new_best: BaseCallback,
+        watch: Watch,
         after_each: BaseCallback | None = None,
     ) -> None:
         super().__init__(
@@ -110,13 +116,14 @@ class Evaluation(EvalCallback):
             callback_after_eval=after_each,
             n_eval_episodes=episodes,
             eval_freq=1,  # whenever _on_step below lets it
-            log_path=str(folder),
-            best_model_save_path=str(folder),
+            log_path=str(folder / UNFINISHED),
+            best_model_save_path=str(folder / UNFINISHED),
             deterministic=deterministic,
             verbose=0,
         )
         self.folder = folder
         self.every = every
+        self.watch = watch
 
     @property
     def count(self) -> int:
@@ -155,6 +162,10 @@ class Evaluation(EvalCallback):
         self.evaluations_length = saved.lengths
         self.evaluations_successes = saved.successes
 
+    def _init_callback(self) -> None:
+        super()._init_callback()  # makes the folder
+        (self.folder / UNFINISHED).rmdir()
+
     def _on_training_start(self) -> None:
         self.next = (self.model.num_timesteps // self.every + 1) * self.every
 
@@ -163,14 +174,33 @@ class Evaluation(EvalCallback):
             return True
         self.next = (self.num_timesteps // self.every + 1) * self.every
         check_networks(self.model)
+        with self._whole_files():
+            go_on = self._evaluate()
+        check_return(self.last_mean_reward, self.num_timesteps)
+        best = self.best_mean_reward if np.isfinite(self.best_mean_reward) else None
+        std = float(np.std(self.evaluations_results[-1]))
+        self.watch.evaluated(self.num_timesteps, self.last_mean_reward, std, best)
+        return go_on
+
+    def _evaluate(self) -> bool:
         policy = unwrapped(self.model.policy)
         assert isinstance(policy, SparsePolicyMixin)
         if not any(network.denser for network in policy.sparse.networks):
-            go_on = super()._on_step()
-        else:
-            kept, self.best_model_save_path = self.best_model_save_path, None
-            go_on = super()._on_step()
-            self.best_model_save_path = kept
-            self.best_mean_reward = -np.inf
-        check_return(self.last_mean_reward, self.num_timesteps)
+            return super()._on_step()
+        kept, self.best_model_save_path = self.best_model_save_path, None
+        go_on = super()._on_step()
+        self.best_model_save_path = kept
+        self.best_mean_reward = -np.inf
         return go_on
+
+    @contextmanager
+    def _whole_files(self) -> Iterator[None]:
+        """Replace best model and evaluations once they are written, so that a full disk cannot."""
+        new = self.folder / UNFINISHED
+        new.mkdir(exist_ok=True)
+        try:
+            yield
+            for path in new.iterdir():
+                path.replace(self.folder / path.name)
+        finally:
+            shutil.rmtree(new, ignore_errors=True)

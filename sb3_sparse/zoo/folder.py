@@ -19,6 +19,23 @@ OF_ENVIRONMENT = ("env_wrapper", "vec_env_wrapper", "frame_stack", "env_kwargs",
 RESTORE = "restore it, or copy the zip out of the folder and give it with --env and --vecnormalize"
 
 
+def new_run_folder(parent: Path, env_name: str) -> Path:
+    """Make and return ``parent/<env>_<n>`` with the next free number."""
+    parent.mkdir(parents=True, exist_ok=True)
+    while True:
+        taken = [
+            int(number)
+            for folder in parent.glob(f"{env_name}_*")
+            if (number := folder.name.removeprefix(f"{env_name}_")).isdigit()
+        ]
+        folder = parent / f"{env_name}_{max(taken, default=0) + 1}"
+        try:
+            folder.mkdir()
+        except FileExistsError:  # another run was quicker
+            continue
+        return folder
+
+
 def is_run(folder: Path) -> bool:
     """Whether a folder is that of a run."""
     return len(list(folder.glob(f"*/{ARGUMENTS}"))) == 1

@@ -19,6 +19,7 @@ from sb3_sparse.sparsity.widths import equivalent_widths
 
 EXTRACTOR = "features_extractor_class"
 EXTRACTOR_KWARGS = "features_extractor_kwargs"
+OF_EXTRACTOR = ("channels", "features_dim")
 
 
 @dataclass(frozen=True)
@@ -35,6 +36,16 @@ class Match:
     target: int
     achieved: int
     policy_kwargs: dict[str, Any]
+
+    def __str__(self) -> str:
+        widths = {"net_arch": self.policy_kwargs["net_arch"]}
+        extractor = self.policy_kwargs.get(EXTRACTOR_KWARGS, {})
+        widths.update({name: extractor[name] for name in OF_EXTRACTOR if name in extractor})
+        built = ", ".join(f"{name} {width}" for name, width in widths.items())
+        return (
+            f"Built a dense network of {built}: {self.achieved:,} parameters; at "
+            f"{self.sparsity:.4g} sparsity the full one has {self.target:,}"
+        )
 
 
 def match_parameters(

@@ -12,7 +12,8 @@ import gymnasium as gym
 import torch as th
 from gymnasium import spaces
 
-from sb3_sparse.errors import ConfigError, MissingExtra, SparsityError
+from sb3_sparse.errors import ConfigError, MissingExtra, SparsityError, Unwritable
+from sb3_sparse.zoo.disk import refusal
 from sb3_sparse.zoo.experiment import spaces_of
 from sb3_sparse.zoo.match import Match, match_parameters, untrained_policy
 from sb3_sparse.zoo.record import sparsity_of, versions, write_record
@@ -113,6 +114,9 @@ def explained(failure: str, env_id: str) -> Iterator[None]:
             raise MissingExtra(env_id, "mujoco") from error
         raise ConfigError(f"{env_id} cannot be made: {error}") from error
     except Exception as error:
+        refused = refusal(error, Path())
+        if refused is not None:
+            raise Unwritable(f"{refused}; free space, or make the folder writable") from error
         raise ConfigError(f"{failure}: {type(error).__name__}: {error}") from error
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from statistics import fmean
 
 from rich.console import Console
@@ -9,21 +10,64 @@ from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
     Progress,
+    TaskID,
     TextColumn,
+    TimeElapsedColumn,
     TimeRemainingColumn,
 )
-from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.policies.mixin import SparsePolicyMixin
+from sb3_sparse.zoo.match import Match
+from sb3_sparse.zoo.watch import Watch
 
 REFRESH_STEPS = 100
 
 
-class TrainingProgress(BaseCallback):
-    """A bar with the mean return of the last episodes and the sparsity.
+class EpisodesProgress:
+    """A bar of the episodes that are played; on something that is no terminal, a line for each set.
 
-    On something that is no terminal, a line every tenth of the run instead.
+    What plays them may silence ``sys.stdout``: the bar goes to where it pointed before.
+
+    :param console: where to print
+    """
+
+    def __init__(self, console: Console) -> None:
+        self.progress = Progress(
+            TextColumn("{task.description}", markup=False),
+            BarColumn(bar_width=30),
+            MofNCompleteColumn(),
+            TextColumn("episodes"),
+            TimeElapsedColumn(),
+            console=Console(file=console.file, highlight=False, markup=False),
+            disable=not console.is_terminal,
+            transient=True,
+            redirect_stdout=False,
+            redirect_stderr=False,
+        )
+        self.tasks: dict[str, TaskID] = {}
+
+    def __call__(self, what: str, done: int, planned: int) -> None:
+        """Show how far it is.
+
+        :param what: who plays, e.g. ``"Last policy"``
+        """
+        if what not in self.tasks:
+            self.tasks[what] = self.progress.add_task(what, total=planned)
+            if self.progress.disable:
+                self.progress.console.print(f"{what}: {planned} episodes")
+            self.progress.start()
+        self.progress.update(self.tasks[what], completed=done)
+
+    def close(self) -> None:
+        """Give the terminal back, also after an interruption."""
+        self.progress.stop()
+
+
+class TrainingProgress(Watch):
+    """A line for each evaluation, and a bar with the return of the last episodes and the sparsity.
+
+    On something that is no terminal, a line every tenth of the run in place of the bar.
 
     :param console: where to print
     """
@@ -31,6 +75,8 @@ class TrainingProgress(BaseCallback):
     def __init__(self, console: Console) -> None:
         super().__init__()
         self.console = console
+        self.folder: Path | None = None
+        self.episodes = EpisodesProgress(console)
         self.progress = Progress(
             BarColumn(bar_width=30),
             MofNCompleteColumn(),
@@ -39,6 +85,21 @@ class TrainingProgress(BaseCallback):
             console=console,
             disable=not console.is_terminal,
         )
+
+    def begins(self, folder: Path, match: Match | None) -> None:
+        self.folder = folder
+        if match is not None:
+            self.console.print(str(match), soft_wrap=True)
+
+    def evaluated(self, step: int, mean: float, std: float, best: float | None) -> None:
+        so_far = "no best yet, still too dense" if best is None else f"best so far {best:.1f}"
+        self.console.print(
+            f"evaluated at step {step}: return {mean:.1f} ± {std:.1f}, {so_far}",
+            soft_wrap=True,
+        )
+
+    def plays(self, what: str, done: int, planned: int) -> None:
+        self.episodes(what, done, planned)
 
     def _on_training_start(self) -> None:
         self.planned = self.model._total_timesteps
@@ -76,3 +137,4 @@ class TrainingProgress(BaseCallback):
     def close(self) -> None:
         """Give the terminal back, also after an interruption."""
         self.progress.stop()
+        self.episodes.close()

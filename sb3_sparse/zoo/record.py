@@ -36,8 +36,12 @@ def write_record(folder: Path, **content: Any) -> None:
     path = folder / NAME
     known = read_json(path, WHAT, CURE) if path.is_file() else {"format": FORMAT}
     new = path.with_suffix(".new")
-    new.write_text(json.dumps({**known, **content}, indent=1, default=_plain) + "\n")
-    new.replace(path)
+    try:
+        new.write_text(json.dumps({**known, **content}, indent=1, default=_plain) + "\n")
+        new.replace(path)
+    except OSError:
+        new.unlink(missing_ok=True)  # half a file on a full disk
+        raise
 
 
 def read_record(folder: Path) -> dict[str, Any]:

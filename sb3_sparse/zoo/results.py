@@ -15,10 +15,12 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
 from sb3_sparse.loading.guard import reading
+from sb3_sparse.policies.compiled import unwrapped
+from sb3_sparse.policies.mixin import SparsePolicyMixin
 from sb3_sparse.zoo.divergence import check_return
 from sb3_sparse.zoo.run import Run
+from sb3_sparse.zoo.watch import Watch, counting
 
-FINAL_EPISODES = 20
 SCORED_SHARE = 0.1
 
 
@@ -58,6 +60,23 @@ class Outcome:
         """Whether it came to its end."""
         return bool(self.results)
 
+    @property
+    def sparsity(self) -> float:
+        """Of the model now."""
+        return self._policy.sparse.sparsity
+
+    @property
+    def wanted_sparsity(self) -> float:
+        """That its settings ask for."""
+        layers = list(self._policy.sparse.layers)
+        return 1.0 - sum(one.final_nnz for one in layers) / sum(one.size for one in layers)
+
+    @property
+    def _policy(self) -> SparsePolicyMixin:
+        policy = unwrapped(self.model.policy)
+        assert isinstance(policy, SparsePolicyMixin)
+        return policy
+
 
 def score_of(mean_returns: Sequence[float]) -> float:
     """Score of a run: the mean over the last 10 % of its evaluations, and at least one.
@@ -71,31 +90,49 @@ def score_of(mean_returns: Sequence[float]) -> float:
 
 
 def final_results(
-    run: Run, model: BaseAlgorithm, path: Path, envs: VecEnv, deterministic: bool
+    run: Run,
+    model: BaseAlgorithm,
+    path: Path,
+    envs: VecEnv,
+    deterministic: bool,
+    episodes: int,
+    watch: Watch,
 ) -> tuple[Result, ...]:
-    """Evaluate the last policy and the best one on episodes that neither was chosen by."""
+    """Evaluate the last policy and the best one on episodes that neither was chosen by.
+
+    :param path: where the last policy lies; the best one lies beside it
+    :param episodes: of each, as many as an evaluation during training has
+    :param watch: is told of each episode
+    """
     if model.get_vec_normalize_env() is not None:
         assert model.env is not None
         sync_envs_normalization(model.env, envs)
-    results = [_evaluate("Last policy", run, model, path, envs, deterministic)]
+
+    def result(what: str, path: Path) -> Result:
+        def tell(done: int) -> None:
+            watch.plays(f"Evaluating the {what.lower()}", done, episodes)
+
+        envs.seed(run.seed + 10_000)
+        tell(0)
+        mean, std = evaluate_policy(
+            model,
+            envs,
+            n_eval_episodes=episodes,
+            deterministic=deterministic,
+            callback=counting(tell),
+        )
+        assert not isinstance(mean, list)
+        assert not isinstance(std, list)
+        check_return(mean, model.num_timesteps)
+        tell(episodes)
+        return Result(what, float(mean), float(std), episodes, path)
+
+    results = [result("Last policy", path)]
     best = path.with_name("best_model.zip")
     if best.is_file():
         last: Any = deepcopy(model.get_parameters())
         with reading(best, "best model of this run", "remove it, and resume the run"):
             model.set_parameters(str(best))
-        results.append(_evaluate("Best policy", run, model, best, envs, deterministic))
+        results.append(result("Best policy", best))
         model.set_parameters(last)
     return tuple(results)
-
-
-def _evaluate(
-    what: str, run: Run, model: BaseAlgorithm, path: Path, envs: VecEnv, deterministic: bool
-) -> Result:
-    envs.seed(run.seed + 10_000)
-    mean, std = evaluate_policy(
-        model, envs, n_eval_episodes=FINAL_EPISODES, deterministic=deterministic
-    )
-    assert not isinstance(mean, list)
-    assert not isinstance(std, list)
-    check_return(mean, model.num_timesteps)
-    return Result(what, float(mean), float(std), FINAL_EPISODES, path)

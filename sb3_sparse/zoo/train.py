@@ -4,35 +4,38 @@ from __future__ import annotations
 
 import importlib.util
 import shutil
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_sparse.errors import ConfigError, Diverged, SparsityError
+from sb3_sparse.errors import ConfigError, command
 from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.policies.mixin import SparsePolicyMixin
 from sb3_sparse.zoo.checkpoint import (
     Checkpoints,
     StopTraining,
     clear_checkpoints,
-    keep_last_finite,
     last_checkpoint,
     locked,
     restored_monitors,
 )
+from sb3_sparse.zoo.disk import writing
 from sb3_sparse.zoo.divergence import check_networks
+from sb3_sparse.zoo.ending import diverging, recorded
 from sb3_sparse.zoo.evaluation import Evaluated, Evaluation
 from sb3_sparse.zoo.experiment import Experiment, spaces_of
+from sb3_sparse.zoo.folder import new_run_folder
 from sb3_sparse.zoo.plan import check_start, planned
 from sb3_sparse.zoo.prepare import doubt, explained, prepare
 from sb3_sparse.zoo.record import DIVERGED, NAME, read_record, sparsity_of, write_record
 from sb3_sparse.zoo.results import Outcome, final_results
 from sb3_sparse.zoo.run import Run
 from sb3_sparse.zoo.speed import denormals_as_zero, use_few_threads
+from sb3_sparse.zoo.watch import Watch
 
 EVALUATION_ENVS = 10
 
@@ -44,6 +47,7 @@ def train(
     tensorboard_log: str = "",
     after_evaluation: BaseCallback | None = None,
     folder: Path | None = None,
+    watch: Watch | None = None,
 ) -> Outcome:
     """Train anew in ``log_folder/<algo>/<env>_<number>``.
 
@@ -54,6 +58,7 @@ def train(
     :param after_evaluation: called after each evaluation; the evaluation is its ``parent``
     :param folder: the run's own folder, ``.../<algo>/<name>``, in place of the next free number in
         ``log_folder``; nothing else may be in it
+    :param watch: is called as a callback, and told of what happens
     :raises ConfigError: if the environment cannot be made or the algorithm cannot act in it
     :raises Diverged: if networks come to hold NaN; the record has the status ``"diverged"``
     """
@@ -64,15 +69,16 @@ def train(
     prepared = prepare(run, log_folder)
     settings, evaluation = prepared.settings, prepared.evaluation
     use_few_threads(prepared.observation_space)
-    if folder is None:
-        folder = new_run_folder(log_folder / run.algo, run.env_id.replace("/", "-"))
-    else:
-        folder.mkdir(parents=True, exist_ok=True)
+    with writing(folder or log_folder, "make it writable, or give another with --log-folder"):
+        if folder is None:
+            folder = new_run_folder(log_folder / run.algo, run.env_id.replace("/", "-"))
+        else:
+            folder.mkdir(parents=True, exist_ok=True)
     with locked(folder):
         if (folder / NAME).is_file():
             raise ConfigError(
-                f"there is a run in {folder} already; go on with it (sb3-sparse train --resume), "
-                "or give another folder"
+                f"there is a run in {folder} already; go on with it by "
+                f"{command('train', '--resume', folder)}, or give another folder"
             )
         write_record(
             folder,
@@ -80,27 +86,31 @@ def train(
             **prepared.record(run),
             tensorboard_log=tensorboard_log,
         )
+        watch = watch or Watch()
+        watch.begins(folder, prepared.match)
         model = None
         try:
             with explained(doubt(run), run.env_id):
                 experiment = Experiment(run, settings, folder, evaluation, None, tensorboard_log)
                 model = experiment.setup()
-            return _learn(run, experiment, model, folder, None, callbacks, after_evaluation)
-        except Diverged as error:
-            assert model is not None
-            raise _recorded(folder, error, model, experiment.env_name) from error
-        except Exception as error:
+            with recorded(folder, experiment.env_name, model):
+                return _learn(
+                    run, experiment, model, folder, None, callbacks, watch, after_evaluation
+                )
+        except Exception:
             if model is None or model.num_timesteps == 0:
-                shutil.rmtree(folder)  # nothing was trained
-            else:
-                _record_failure(folder, error)
+                shutil.rmtree(folder, ignore_errors=True)  # nothing was trained
             raise
 
 
-def resume(folder: Path, callbacks: Sequence[BaseCallback] = ()) -> Outcome:
+def resume(
+    folder: Path, callbacks: Sequence[BaseCallback] = (), watch: Watch | None = None
+) -> Outcome:
     """Go on with an interrupted run from its last checkpoint, or from the start if it has none.
 
     :param folder: the run's folder
+    :param callbacks: further callbacks
+    :param watch: is called as a callback, and told of what happens
     :raises ConfigError: if there is no run, if it is finished or diverged, or if another process
         trains it
     :raises Diverged: if it diverges now
@@ -111,7 +121,7 @@ def resume(folder: Path, callbacks: Sequence[BaseCallback] = ()) -> Outcome:
         if record["status"] == "finished":
             clear_checkpoints(folder)
             raise ConfigError(
-                f"the run in {folder} is finished; look at it with sb3-sparse enjoy {folder}, or "
+                f"the run in {folder} is finished; look at it with {command('enjoy', folder)}, or "
                 "train longer anew with -n"
             )
         if record["status"] == DIVERGED:
@@ -133,35 +143,10 @@ def resume(folder: Path, callbacks: Sequence[BaseCallback] = ()) -> Outcome:
                 stack.enter_context(restored_monitors(folder, start))
             experiment = Experiment(run, settings, folder, evaluation, start, plan.tensorboard_log)
             model = experiment.setup()
-        try:
-            return _learn(run, experiment, model, folder, start, callbacks)
-        except Diverged as error:
-            raise _recorded(folder, error, model, experiment.env_name) from error
-        except Exception as error:
-            _record_failure(folder, error)
-            raise
-
-
-def _record_failure(folder: Path, error: Exception) -> None:
-    write_record(folder, status="failed", error=f"{type(error).__name__}: {error}")
-
-
-def _recorded(folder: Path, error: Diverged, model: BaseAlgorithm, env_name: str) -> Diverged:
-    """Write down that a run diverged, and keep its last policy of numbers; what to raise."""
-    step = keep_last_finite(folder, env_name)
-    kept = (
-        "no policy was saved before" if step is None else f"the last policy is that of step {step}"
-    )
-    text = f"{error}. In {folder} {kept}"
-    write_record(
-        folder,
-        status=DIVERGED,
-        error=text,
-        num_timesteps=model.num_timesteps,
-        last_policy=step,
-    )
-    clear_checkpoints(folder)
-    return Diverged(text)
+        watch = watch or Watch()
+        watch.begins(folder, None)
+        with recorded(folder, experiment.env_name, model):
+            return _learn(run, experiment, model, folder, start, callbacks, watch)
 
 
 def _learn(
@@ -171,6 +156,7 @@ def _learn(
     folder: Path,
     start: Path | None,
     callbacks: Sequence[BaseCallback],
+    watch: Watch,
     after_evaluation: BaseCallback | None = None,
 ) -> Outcome:
     policy = unwrapped(model.policy)
@@ -186,9 +172,11 @@ def _learn(
         schedule["eval_episodes"],
         experiment.deterministic_eval,
         experiment.keep_normalization(),
+        watch,
         after_evaluation,
     )
     checkpoints = Checkpoints(folder, experiment.env_name, evaluation)
+    during = [*experiment.callbacks, evaluation, checkpoints, *callbacks, watch]
     if start is None:
         evaluation.forget()
     elif start != folder:
@@ -201,10 +189,10 @@ def _learn(
         if done < planned:
             status = "evaluating"
             try:
-                with checkpoints.on_signals(), denormals_as_zero(), _diverging(model):
+                with checkpoints.on_signals(), denormals_as_zero(), diverging(model):
                     model.learn(
                         planned - done,
-                        callback=[*experiment.callbacks, evaluation, checkpoints, *callbacks],
+                        callback=during,
                         reset_num_timesteps=start is None,
                         tb_log_name=f"{run.algo}_{folder.name}",
                     )
@@ -221,7 +209,15 @@ def _learn(
         )
         if checkpoints.stop_wanted:
             return Outcome(folder, model, ())
-        results = final_results(run, model, path, envs, experiment.deterministic_eval)
+        results = final_results(
+            run,
+            model,
+            path,
+            envs,
+            experiment.deterministic_eval,
+            schedule["eval_episodes"],
+            watch,
+        )
     finally:
         envs.close()
         assert model.env is not None
@@ -231,44 +227,3 @@ def _learn(
     )
     clear_checkpoints(folder)
     return Outcome(folder, model, results)
-
-
-@contextmanager
-def _diverging(model: BaseAlgorithm) -> Iterator[None]:
-    """Within it, an error of networks that hold NaN, which may say anything, is said to be that."""
-    try:
-        yield
-    except SparsityError:
-        raise
-    except StopTraining:
-        raise
-    except Exception as error:
-        try:
-            check_networks(model)
-        except Diverged as diverged:
-            raise diverged from error
-        raise
-
-
-def new_run_folder(parent: Path, env_name: str) -> Path:
-    """Make and return ``parent/<env>_<n>`` with the next free number."""
-    parent.mkdir(parents=True, exist_ok=True)
-    while True:
-        taken = [
-            int(number)
-            for folder in parent.glob(f"{env_name}_*")
-            if (number := folder.name.removeprefix(f"{env_name}_")).isdigit()
-        ]
-        folder = parent / f"{env_name}_{max(taken, default=0) + 1}"
-        try:
-            folder.mkdir()
-        except FileExistsError:  # another run was quicker
-            continue
-        return folder
-
-
-def reached_sparsity(model: BaseAlgorithm) -> float:
-    """Sparsity of a model now."""
-    policy = unwrapped(model.policy)
-    assert isinstance(policy, SparsePolicyMixin)
-    return policy.sparse.sparsity

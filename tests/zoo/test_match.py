@@ -97,3 +97,17 @@ def test_impala_scales_channels_and_dense_units():
 def test_unknown_widths_are_asked_for():
     with pytest.raises(ConfigError, match=r"net_arch:\[256,256\]"):
         match_parameters(SAC, VECTOR, ACTIONS, settings(), 0.9)
+
+
+def test_a_match_says_what_was_built():
+    dqn = match_parameters(DQN, VECTOR, spaces.Discrete(2), settings(net_arch=[64, 64]), 0.9)
+    width, _ = dqn.policy_kwargs["net_arch"]
+    parameters = 18 * width + (width + 1) * width + (width + 1) * 2
+    assert str(dqn) == (
+        f"Built a dense network of net_arch [{width}, {width}]: {parameters:,} parameters; at 0.9 "
+        f"sparsity the full one has {dqn.target:,}"
+    )
+    images = match_parameters(DQN, IMAGES, spaces.Discrete(2), settings(net_arch=[]), 0.9)
+    built = images.policy_kwargs["features_extractor_kwargs"]
+    said = f"net_arch [], channels {built['channels']}, features_dim {built['features_dim']}: "
+    assert said in str(images)

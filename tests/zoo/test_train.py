@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import shutil
 import signal
@@ -16,13 +17,15 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import load_results
 from support import ALGORITHMS
 
-from sb3_sparse.errors import ConfigError, CorruptStateError, Diverged
+from sb3_sparse.errors import ConfigError, CorruptStateError, Diverged, Unwritable
 from sb3_sparse.zoo.checkpoint import last_checkpoint
 from sb3_sparse.zoo.enjoy import enjoy
-from sb3_sparse.zoo.record import read_record
-from sb3_sparse.zoo.replay import restore_buffer
+from sb3_sparse.zoo.folder import new_run_folder
+from sb3_sparse.zoo.record import read_record, write_record
+from sb3_sparse.zoo.replay import BufferSaver, restore_buffer
 from sb3_sparse.zoo.run import Run, algorithms
-from sb3_sparse.zoo.train import new_run_folder, resume, train
+from sb3_sparse.zoo.train import resume, train
+from sb3_sparse.zoo.watch import Watch
 
 SMALL = {"net_arch": [16, 16], "batch_size": 16}
 QUICK = dict(eval_freq=200, eval_episodes=2)
@@ -335,6 +338,105 @@ def test_a_run_that_failed_says_so_and_can_go_on(tmp_path):
     assert read_record(folder)["error"] is None
 
 
+def full(*args, **kwargs):
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
+def test_a_full_disk_says_what_is_kept_and_how_to_go_on(tmp_path, monkeypatch):
+    log_folder = tmp_path / "my logs"
+    save = BufferSaver.save
+    monkeypatch.setattr(BufferSaver, "save", lambda *a: (full if a[2] > 400 else save)(*a))
+    with pytest.raises(Unwritable, match="No space left on device. The run stopped at") as caught:
+        train(DQN_RUN, log_folder)
+    monkeypatch.undo()
+    folder = log_folder / "dqn" / "CartPole-v1_1"
+    assert f"{folder} cannot be written" in str(caught.value)
+    assert f"from step 400: sb3-sparse train --resume '{folder}'" in str(caught.value)
+    record = read_record(folder)
+    assert (record["status"], "No space left" in record["error"]) == ("failed", True)
+    assert [path.name for path in (folder / "resume").iterdir()] == ["400"]
+    assert resume(folder).finished
+
+
+def test_a_record_that_cannot_be_written_stays_as_it_is(tmp_path, monkeypatch):
+    write_record(tmp_path, status="running", number=1)
+    monkeypatch.setattr(Path, "replace", full)
+    with pytest.raises(OSError, match="No space left"):
+        write_record(tmp_path, status="finished")
+    monkeypatch.undo()
+    assert read_record(tmp_path) == {"format": 1, "status": "running", "number": 1}
+    assert [path.name for path in tmp_path.iterdir()] == ["sparsity.json"]
+
+
+def test_a_full_disk_under_everything_leaves_the_status_of_a_run_that_was_killed(
+    tmp_path, monkeypatch
+):
+    class Fill(BaseCallback):
+        def _on_step(self) -> bool:
+            if self.num_timesteps == 450:
+                monkeypatch.setattr(Path, "replace", full)
+                monkeypatch.setattr(BufferSaver, "save", full)
+            return True
+
+    with pytest.raises(Unwritable, match="goes on from step 400"):
+        train(DQN_RUN, tmp_path, [Fill()])
+    monkeypatch.undo()
+    folder = tmp_path / "dqn" / "CartPole-v1_1"
+    assert read_record(folder)["status"] == "running"
+    DQN.load(folder / "best_model.zip")
+    assert evaluations(folder)[0] == [200, 400]  # as before the disk was full
+    assert resume(folder).finished
+
+
+def test_a_folder_that_cannot_be_written_to_is_named_with_the_option(tmp_path):
+    (tmp_path / "logs").write_text("no folder")
+    with pytest.raises(Unwritable, match="cannot be written: Not a directory.*--log-folder"):
+        train(DQN_RUN, tmp_path / "logs")
+
+
+class Seen(Watch):
+    """Notes what a run tells."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.folders, self.evaluations, self.episodes = [], [], []
+
+    def begins(self, folder, match) -> None:
+        self.folders.append((folder, match))
+
+    def evaluated(self, step, mean, std, best) -> None:
+        self.evaluations.append((step, mean, std, best))
+
+    def plays(self, what, done, planned) -> None:
+        self.episodes.append((what, done, planned))
+
+
+def test_a_run_tells_of_each_evaluation_and_each_episode_at_its_end(tmp_path):
+    seen = Seen()
+    outcome = train(DQN_RUN, tmp_path, watch=seen)
+    assert seen.folders == [(outcome.folder, None)]
+    steps, results = evaluations(outcome.folder)
+    assert [one[0] for one in seen.evaluations] == steps
+    assert [one[1] for one in seen.evaluations] == results.mean(axis=1).tolist()
+    assert [one[2] for one in seen.evaluations] == results.std(axis=1).tolist()
+    best = np.maximum.accumulate(results.mean(axis=1))
+    assert [one[3] for one in seen.evaluations] == best.tolist()
+    for what in (
+        "Evaluating the last policy",
+        "Evaluating the best policy",
+    ):  # as many as --eval-episodes says
+        told = [one[1:] for one in seen.episodes if one[0] == what]
+        assert told == [(0, 2), (1, 2), (2, 2)]
+    assert [result.episodes for result in outcome.results] == [2, 2]
+
+
+def test_while_a_run_is_pruned_there_is_no_best(tmp_path):
+    seen = Seen()
+    run = replace(DQN_RUN, method="prune")
+    train(run, tmp_path, watch=seen)
+    assert [best is None for *_, best in seen.evaluations] == [True, True, True, True, False]
+
+
 def test_a_checkpoint_that_cannot_be_read_is_named(tmp_path):
     stopped = train(DQN_RUN, tmp_path, [Stop(500)])
     (last_checkpoint(stopped.folder) / "CartPole-v1.zip").write_bytes(b"")
@@ -446,8 +548,8 @@ def test_masks_move_after_a_resume_as_the_schedule_says(tmp_path):
 
 
 def test_a_dense_run_of_equal_parameters_says_what_it_reached(tmp_path):
-    run = Run(method="dense", match_params=0.9, n_timesteps=200, **QUICK)
-    outcome = train(run, tmp_path)
+    run, seen = Run(method="dense", match_params=0.9, n_timesteps=200, **QUICK), Seen()
+    outcome = train(run, tmp_path, watch=seen)
     record = read_record(outcome.folder)
     match = record["match"]
     assert match["target"] == (2048 + 23451 + 1024) + 512 + 512 + 2  # the vector of 4-512-512-2
@@ -456,6 +558,8 @@ def test_a_dense_run_of_equal_parameters_says_what_it_reached(tmp_path):
     assert match["achieved"] == 5 * width + (width + 1) * width + (width + 1) * 2
     assert abs(match["achieved"] - match["target"]) < 170  # one unit more or less is twice that
     assert record["total"]["sparsity"] == 0
+    ((_, told),) = seen.folders
+    assert (told.target, told.achieved) == (match["target"], match["achieved"])
 
 
 def test_tensorboard_goes_on_in_the_same_folder(tmp_path):
@@ -542,7 +646,6 @@ def test_every_method_and_algorithm_runs_by_its_config(method, algo, tmp_path):
 
 
 def test_an_atari_run_stacks_frames_resumes_and_is_filmed(tmp_path, monkeypatch):
-    monkeypatch.setattr("sb3_sparse.zoo.results.FINAL_EPISODES", 1)
     small = {"channels": [2, 2, 2], "features_dim": 8}
     run = Run(
         env_id="PongNoFrameskip-v4",
