@@ -31,7 +31,8 @@ def test_tune_searches_writes_the_best_goes_on_and_reports(tmp_path):
     )
     assert f"Study {STUDY}: 2 of 2 trials are done." in lines
     best = tmp_path / "logs" / "tune" / STUDY / "best.yml"
-    command = f"sb3-sparse train --algo dqn --env CartPole-v1 --conf-file {best}"
+    given = best.relative_to(tmp_path)  # as --log-folder is
+    command = f"sb3-sparse train --algo dqn --env CartPole-v1 --conf-file {given}"
     assert command in lines
     assert f"sb3-sparse tune report {STUDY}" in lines
     merged = yaml.safe_load(target.read_text())
