@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, NatureCNN
 
+from sb3_sparse.errors import UnsupportedError
 from sb3_sparse.policies.mixin import SparsePolicyMixin, with_extractor
 from sb3_sparse.policies.spec import NetworkSpec
+
+
+class NoSuchPart(UnsupportedError, AttributeError):
+    """Another algorithm's policy has the attribute, and a sparse one has not."""
 
 
 class SparseActorCriticPolicy(SparsePolicyMixin, ActorCriticPolicy):
@@ -27,6 +33,14 @@ class SparseActorCriticPolicy(SparsePolicyMixin, ActorCriticPolicy):
         ),
     }
     functional_gradients = True  # TRPO's actor; SB3 does not say which algorithm builds the policy
+
+    def __getattr__(self, name: str) -> Any:
+        if name == "lstm_actor":  # what RecurrentPPO asks for first, before it checks the class
+            raise NoSuchPart(
+                "RecurrentPPO has no sparse policy, since an LSTM cannot be masked; PPO, A2C and "
+                "TRPO have one"
+            )
+        return super().__getattr__(name)
 
     def _initial_gain(self, layer_name: str) -> float:
         if not self.ortho_init:

@@ -73,7 +73,7 @@ class SparsePolicyMixin(BasePolicy):
         self,
         observation_space: spaces.Space[Any],
         action_space: spaces.Space[Any],
-        lr_schedule: Schedule,
+        lr_schedule: Schedule | None = None,
         *,
         sparsity: float | Mapping[str, float] | None = None,
         initial_sparsity: float | None = None,
@@ -86,6 +86,12 @@ class SparsePolicyMixin(BasePolicy):
         compute: str = "auto",
         **kwargs: Any,
     ) -> None:
+        if lr_schedule is None:
+            raise UnsupportedError(
+                f"{type(self).__name__} got no learning-rate schedule: it cannot serve an "
+                "algorithm that learns without gradients, such as ARS, which has no sparse policy. "
+                "sb3_sparse.supported_algorithms() lists those that have one"
+            )
         config = SparsityConfig(
             sparsity=sparsity,
             initial_sparsity=initial_sparsity,

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import pytest
+import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, NatureCNN
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
 from support import ALGORITHMS, DISCRETE, assert_masked, make
 
-from sb3_sparse import SparsityCallback
+from sb3_sparse import SparseActorCriticPolicy, SparsityCallback
 from sb3_sparse.errors import UnsupportedError
+from sb3_sparse.policies.compiled import unwrapped
 
 CALLBACK = dict(update_interval=5, drop_fraction=0.5)
 CNN = dict(features_extractor_kwargs=dict(features_dim=16), net_arch=[16])
@@ -164,3 +166,25 @@ def test_observations_that_sb3_cannot_preprocess_are_refused():
     odd = spaces.Tuple((spaces.Discrete(2), spaces.Discrete(2)))
     with pytest.raises(UnsupportedError, match=r"Tuple.*Box.*Dict"):
         SparseSACPolicy(odd, spaces.Box(-1, 1, (1,)), lambda _: 1e-3, sparsity=0.5)
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "message"),
+    [("RecurrentPPO", "RecurrentPPO has no sparse policy"), ("ARS", "such as ARS, which has no")],
+)
+def test_an_algorithm_without_a_sparse_policy_says_so_for_the_class_too(algorithm, message):
+    contrib = pytest.importorskip("sb3_contrib")
+    with pytest.raises(UnsupportedError, match=message):
+        getattr(contrib, algorithm)(
+            SparseActorCriticPolicy, "Pendulum-v1", policy_kwargs=dict(sparsity=0.9)
+        )
+
+
+@pytest.mark.parametrize("name", ["SAC", "PPO", "DQN"])
+def test_the_callback_works_on_a_compiled_policy(name):
+    model = make(name)
+    model.policy = th.compile(model.policy, backend="eager")
+    model.learn(70, callback=SparsityCallback("set", update_interval=2))
+    assert model.policy.sparse.networks[0].mask_updates
+    model.policy = unwrapped(model.policy)
+    assert_masked(model)

@@ -265,7 +265,8 @@ def test_a_plan_of_a_training_that_is_over_is_dropped_at_the_next_one():
     assert controller.plan is None
 
 
-def test_weight_decay_is_coupled_added_after_clipping_and_on_kernels_only():
+@pytest.mark.parametrize("compact", [False, True])
+def test_weight_decay_is_coupled_added_after_clipping_and_on_kernels_only(compact):
     owner = nn.Sequential(nn.Linear(4, 3))
     owner.optimizer = th.optim.SGD(owner.parameters(), lr=1.0)
     network = SparseNetwork("net", owner, [("0", owner[0])])
@@ -275,6 +276,8 @@ def test_weight_decay_is_coupled_added_after_clipping_and_on_kernels_only():
         owner[0].weight.fill_(2.0)
         owner[0].bias.fill_(2.0)
     network.layers[0].set_mask(np.tile([True, False], 6))
+    if compact:
+        controller.compact(owner)
     (owner[0].weight.sum() + owner[0].bias.sum()).backward()
     # 6 active weights and 3 biases with gradient 1: norm 3, clipped to 1.5.
     nn.utils.clip_grad_norm_(owner.parameters(), 1.5)
@@ -283,6 +286,32 @@ def test_weight_decay_is_coupled_added_after_clipping_and_on_kernels_only():
     expected = np.tile([1.0, 0.0], 6)
     np.testing.assert_allclose(network.layers[0].dense(), expected, rtol=1e-5)
     np.testing.assert_allclose(owner[0].bias.detach(), 1.5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("compact", [False, True])
+@pytest.mark.parametrize("twice", ["in one pass", "in one loss"])
+def test_rigl_sees_the_sum_of_a_layers_gradients_where_it_is_used_twice(compact, twice):
+    """Each use alone would have grown another connection."""
+    owner, layer, controller = rig(drop_fraction=1 / 6)  # one of six
+    if compact:
+        controller.compact(owner)
+        layer = controller.networks[0].layers[0]
+    # The gradient of weight (i, j) is g_i x_j: flat 7 gets 3 + 3, flat 11 gets 5, flat 2 gets 4.
+    uses = [
+        (th.tensor([[0.0, 0.0, 1.0, 1.0]]), th.tensor([[4.0, 3.0, 0.0]])),
+        (th.tensor([[0.0, 0.0, 0.0, 1.0]]), th.tensor([[0.0, 3.0, 5.0]])),
+    ]
+    owner.optimizer.zero_grad()
+    if twice == "in one loss":
+        sum((owner(x) * g).sum() for x, g in uses).backward()
+    else:
+        x, g = (th.cat(parts) for parts in zip(*uses, strict=True))
+        (owner(x) * g).sum().backward()
+    owner.optimizer.step()
+    # Dropped: flat 5 (0.1). Grown: flat 7, with 6.
+    assert np.flatnonzero(layer.mask()).tolist() == [0, 1, 4, 7, 8, 9]
+    # Its first step, with learning rate 1, is that very gradient.
+    assert layer.dense()[7] == pytest.approx(-6.0)
 
 
 class ByGradient(TopologyMethod):
