@@ -68,7 +68,7 @@ class SparsityConfig:
         if self.initial_sparsity is not None:
             check_sparsity(self.initial_sparsity, "initial_sparsity")
         check_distribution(self.distribution)
-        if isinstance(self.dense_layers, str) or not all(
+        if not isinstance(self.dense_layers, (list, tuple)) or not all(
             isinstance(pattern, str) for pattern in self.dense_layers
         ):
             raise ConfigError(

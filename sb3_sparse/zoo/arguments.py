@@ -91,7 +91,7 @@ def _two_widths(critic: str) -> Kind:
     return Kind(f"{{pi: [64, 64], {critic}: [64, 64]}}", fits)
 
 
-NONE = Kind("nothing (null in YAML, None in Python)", lambda v: v is None)
+NONE = Kind("null (None)", lambda v: v is None)
 FLAG = Kind("true or false", lambda v: isinstance(v, bool))
 NUMBER = Kind("a number", is_number)
 POSITIVE = Kind("a number above 0", lambda v: is_number(v) and v > 0)
@@ -107,12 +107,15 @@ CLASS = Kind(
 STEPS = _whole(1)
 DECAY = "lin_ and a number for a linear decay to 0, e.g. lin_0.001"
 AUTO = _word("auto") | _after("auto_", POSITIVE, "auto_ and where it begins, e.g. auto_0.1")
-WRAPPER = NONE | Kind(
-    "a dotted path, a path with its arguments, or a list of these",
-    lambda v: (
-        isinstance(v, (str, Mapping))
-        or (isinstance(v, list) and all(isinstance(one, (str, Mapping)) for one in v))
-    ),
+WRAPPER = (
+    Kind(
+        "a dotted path, a path with its arguments, or a list of these",
+        lambda v: (
+            isinstance(v, (str, Mapping))
+            or (isinstance(v, list) and all(isinstance(one, (str, Mapping)) for one in v))
+        ),
+    )
+    | NONE
 )
 SDE_FREQUENCY = Kind(
     "a whole number, 1 or more, or -1", lambda v: is_whole(v) and (v == -1 or v > 0)
@@ -125,7 +128,7 @@ ALGORITHM: dict[str, Kind] = {
     "cg_damping": _from(0),
     "cg_max_steps": STEPS,
     "clip_range": POSITIVE | _after("lin_", POSITIVE, DECAY),
-    "clip_range_vf": NONE | POSITIVE | _after("lin_", POSITIVE, DECAY),
+    "clip_range_vf": POSITIVE | _after("lin_", POSITIVE, DECAY) | NONE,
     "ent_coef": NUMBER,
     "exploration_final_eps": SHARE,
     "exploration_fraction": SHARE,
@@ -151,16 +154,16 @@ ALGORITHM: dict[str, Kind] = {
     "normalize_advantage": FLAG,
     "optimize_memory_usage": FLAG,
     "policy_delay": STEPS,
-    "replay_buffer_class": NONE | CLASS,
-    "replay_buffer_kwargs": NONE | MAPPING | CODE,
+    "replay_buffer_class": CLASS | NONE,
+    "replay_buffer_kwargs": MAPPING | CODE | NONE,
     "rms_prop_eps": POSITIVE,
-    "rollout_buffer_class": NONE | CLASS,
-    "rollout_buffer_kwargs": NONE | MAPPING,
+    "rollout_buffer_class": CLASS | NONE,
+    "rollout_buffer_kwargs": MAPPING | NONE,
     "sde_sample_freq": SDE_FREQUENCY,
     "stats_window_size": STEPS,
     "sub_sampling_factor": STEPS,
     "target_entropy": _word("auto") | NUMBER,
-    "target_kl": NONE | POSITIVE,
+    "target_kl": POSITIVE | NONE,
     "target_noise_clip": _from(0),
     "target_policy_noise": _from(0),
     "target_update_interval": STEPS,
@@ -172,7 +175,7 @@ ALGORITHM: dict[str, Kind] = {
     "use_sde_at_warmup": FLAG,
     "vf_coef": _from(0),
 }
-_WIDTHS = NONE | Kind("a list of widths, e.g. [256, 256]", _widths)
+_WIDTHS = Kind("a list of widths, e.g. [256, 256]", _widths) | NONE
 _TUNED_ENTROPY = {"ent_coef": _from(0) | AUTO}
 _OFF_POLICY = {"net_arch": _WIDTHS | _two_widths("qf")}
 _ON_POLICY = {"net_arch": _WIDTHS | _two_widths("vf")}
@@ -185,13 +188,13 @@ OF_ONE = {  # where a name means something else
     "ppo": _ON_POLICY,
     "a2c": _ON_POLICY,
     "trpo": {"target_kl": POSITIVE, **_ON_POLICY},
-    "qrdqn": {"max_grad_norm": NONE | ALGORITHM["max_grad_norm"]},
+    "qrdqn": {"max_grad_norm": ALGORITHM["max_grad_norm"] | NONE},
 }
 ZOO: dict[str, Kind] = {
     "callback": WRAPPER,
-    "env_kwargs": NONE | MAPPING,
+    "env_kwargs": MAPPING | NONE,
     "env_wrapper": WRAPPER,
-    "frame_stack": NONE | STEPS,
+    "frame_stack": STEPS | NONE,
     "monitor_kwargs": MAPPING | CODE,
     "n_envs": STEPS,
     "n_timesteps": Kind(
@@ -199,7 +202,7 @@ ZOO: dict[str, Kind] = {
         lambda v: is_number(v) and v >= 1 and v == int(v),
     ),
     "noise_std": _from(0),
-    "noise_type": NONE | _word("normal", "ornstein-uhlenbeck"),
+    "noise_type": _word("normal", "ornstein-uhlenbeck") | NONE,
     "normalize": FLAG | MAPPING | CODE,
     "policy": Kind("a name", lambda v: isinstance(v, str)),
     "policy_kwargs": MAPPING,
@@ -212,7 +215,7 @@ POLICY: dict[str, Kind] = {
     "batch_norm_momentum": SHARE,
     "clip_mean": POSITIVE,
     "features_extractor_class": CLASS,
-    "features_extractor_kwargs": NONE | MAPPING,
+    "features_extractor_kwargs": MAPPING | NONE,
     "full_std": FLAG,
     "log_std_init": NUMBER,
     "n_critics": STEPS,
@@ -220,7 +223,7 @@ POLICY: dict[str, Kind] = {
     "net_arch": _WIDTHS,
     "normalize_images": FLAG,
     "optimizer_class": CLASS,
-    "optimizer_kwargs": NONE | MAPPING,
+    "optimizer_kwargs": MAPPING | NONE,
     "ortho_init": FLAG,
     "renorm_warmup_steps": _whole(0),
     "share_features_extractor": FLAG,

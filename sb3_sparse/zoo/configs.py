@@ -55,6 +55,8 @@ def read_yaml(path: Path, what: str = "environment ids to settings") -> dict[str
 
 
 def _read(path: Path, what: str = "environment ids to settings") -> dict[str, Any]:
+    if path.is_dir():
+        raise ConfigError(f"{path} is a folder; give a YAML file in it")
     if not path.is_file():
         raise ConfigError(f"there is no config file {path}")
     try:

@@ -57,8 +57,7 @@ def prepare(run: Run, log_folder: Path) -> Prepared:
     :raises ConfigError: if something is wrong with device, settings or environment, or the
         algorithm cannot act in it
     """
-    if run.device.startswith("cuda") and not th.cuda.is_available():
-        raise ConfigError(f"there is no device {run.device!r} here; give --device auto or cpu")
+    check_device(run.device)
     settings, evaluation = run.settings(), run.evaluation()
     with explained(doubt(run), run.env_id):
         observation_space, action_space = spaces_of(
@@ -72,6 +71,22 @@ def prepare(run: Run, log_folder: Path) -> Prepared:
         )
         settings["policy_kwargs"] = match.policy_kwargs
     return Prepared(settings, evaluation, observation_space, action_space, match)
+
+
+def check_device(device: str) -> None:
+    """Refuse a device that this machine does not have.
+
+    :raises ConfigError: if so
+    """
+    if device == "auto":
+        return
+    here = ["auto", "cpu"] + (["cuda"] if th.cuda.is_available() else [])
+    try:
+        th.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:  # its own words, of torch
+        raise ConfigError(
+            f"there is no device {device!r} here; give --device {' or '.join(here)}"
+        ) from error
 
 
 def count(run: Run, folder: Path) -> None:

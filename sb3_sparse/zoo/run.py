@@ -210,7 +210,8 @@ def plain(value: Any) -> Any:
 
 
 def _is_path(text: str) -> bool:
-    return Path(text).suffix in (".yml", ".yaml") or Path(text).is_file()
+    path = Path(text)
+    return path.suffix in (".yml", ".yaml") or len(path.parts) > 1 or path.exists()
 
 
 def algorithms() -> dict[str, type[BaseAlgorithm]]:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Set
 from dataclasses import fields
 from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_sparse.callback import SparsityCallback
 from sb3_sparse.engine.optimizers import check_weight_decay
@@ -47,6 +49,12 @@ def check_settings(settings: Mapping[str, Any], algorithm: type[BaseAlgorithm]) 
     import_named(dict(kwargs))
     if settings.get("noise_type") is not None and "noise_std" not in settings:
         raise ConfigError("noise_type needs noise_std, e.g. noise_std: 0.1")
+    stored = issubclass(algorithm, OffPolicyAlgorithm)
+    if stored and settings.get("normalize") and settings.get("frame_stack"):
+        raise ConfigError(
+            f"normalize and frame_stack do not go together in {algo}: Stable-Baselines3 stores "
+            "observations as they were before both, and not stacked; drop one"
+        )
     if "sparsity" not in kwargs:
         raise ConfigError(SPARSITY_MISSING)
     SparsityConfig(**{name: value for name, value in kwargs.items() if name in OF_SPARSITY})
@@ -86,10 +94,9 @@ def _check_value(algo: str, name: str, value: Any) -> None:
 
 def _is_number(text: str) -> bool:
     try:
-        float(text)
+        return math.isfinite(float(text))
     except ValueError:
         return False
-    return True
 
 
 def _check_start(kwargs: Mapping[str, Any], callback: Mapping[str, Any] | None) -> None:

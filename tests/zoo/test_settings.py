@@ -161,6 +161,8 @@ def test_what_the_user_wants_wins_over_the_config():
         (dict(seed=True), "seed must be a whole number, e.g. 100000, got True"),
         (dict(algo=3), "algo must be a text, got 3"),
         (dict(env_id=None), "env_id must be a text, got None"),
+        (dict(conf_file="no/such"), "there is no config file no/such"),
+        (dict(conf_file="/"), "/ is a folder; give a YAML file in it"),
         (dict(conf_file=3), "conf_file must be a text, got 3"),
         (dict(hyperparams=[]), r"hyperparams must be a mapping of names to values, got \[\]"),
         (dict(n_timesteps=1e4), "n_timesteps must be a whole number, e.g. 100000, got 10000.0"),

@@ -488,6 +488,9 @@ def test_a_run_that_cannot_begin_leaves_nothing(tmp_path):
 def test_a_device_that_is_not_there_is_refused(tmp_path):
     with pytest.raises(ConfigError, match="no device 'cuda' here"):
         train(replace(DQN_RUN, device="cuda"), tmp_path)
+    for device in ("gpu", "3", "cuda:77"):
+        with pytest.raises(ConfigError, match=f"no device '{device}' here; give --device auto or"):
+            train(replace(DQN_RUN, device=device), tmp_path)
     assert train(replace(DQN_RUN, n_timesteps=100), tmp_path).model.device.type == "cpu"
     assert read_record(tmp_path / "dqn" / "CartPole-v1_1")["device"] == "cpu"
 
