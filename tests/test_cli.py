@@ -16,6 +16,8 @@ import pytest
 from stable_baselines3 import DQN, PPO
 from support import make
 
+from sb3_sparse.cli import main
+
 QUICK = ["--hyperparams", "net_arch:[24,24]", "batch_size:16"]
 
 
@@ -115,6 +117,25 @@ def test_a_run_that_is_asked_to_stop_says_how_to_go_on(tmp_path):
     steps = DQN.load(folder / "CartPole-v1.zip").num_timesteps
     assert f"Stopped after {steps} steps. Go on with:" in said
     assert "sb3-sparse train --resume logs/dqn/CartPole-v1_1" in said
+
+
+@pytest.mark.parametrize("folder", [None, Path("my logs/dqn/CartPole-v1_3")])
+def test_an_interrupt_says_how_to_go_on_with_this_run(folder, monkeypatch, capsys):
+    def interrupted(run, log_folder, *, tensorboard_log, watch):
+        if folder is not None:
+            watch.begins(folder, None)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("sb3_sparse.zoo.train.train", interrupted)
+    monkeypatch.setattr(sys, "argv", ["sb3-sparse", "train"])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 130
+    last = capsys.readouterr().out.splitlines()[-1]
+    if folder is None:
+        assert last == "Interrupted before the run had begun; nothing is left of it."
+    else:
+        assert last == "sb3-sparse train --resume 'my logs/dqn/CartPole-v1_3'"
 
 
 def test_options_and_a_second_run_beside_the_first(tmp_path):

@@ -60,14 +60,16 @@ def _trained(folder: Path) -> bool:
 
 def _train(cell: Cell, folder: Path) -> bool:
     """Train to the end; whether it was reached."""
+    from sb3_sparse.zoo.progress import TrainingProgress
     from sb3_sparse.zoo.train import resume, train  # rl_zoo3 takes its time to import
 
     callbacks = cell.measures.callbacks(folder)
+    watch = TrainingProgress()  # into the cell's log
     try:
         if (folder / NAME).is_file():
-            return resume(folder, callbacks).finished
+            return resume(folder, callbacks, watch).finished
         _clear(folder)
-        return train(cell.run, callbacks=callbacks, folder=folder).finished
+        return train(cell.run, callbacks=callbacks, folder=folder, watch=watch).finished
     except RunBusy:
         raise
     except ConfigError:

@@ -5,16 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Set
 from contextlib import suppress
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
-from sb3_sparse.callback import SparsityCallback
 from sb3_sparse.errors import ConfigError
-from sb3_sparse.policies.config import SparsityConfig
 from sb3_sparse.topology import method_named
 from sb3_sparse.tuning.backend import BaseDistribution, Trial, optuna, quiet_optuna
 from sb3_sparse.zoo.run import DENSE, Run
-from sb3_sparse.zoo.settings import find_callback, method_of, policy_kwargs_of
+from sb3_sparse.zoo.settings import method_of
 
 CategoricalDistribution = optuna.distributions.CategoricalDistribution
 FloatDistribution = optuna.distributions.FloatDistribution
@@ -195,10 +193,10 @@ def check_space(space: Space, run: Run) -> None:
     samples = samples_of(space)
     _check_names(space, run, {name for values in samples for name in values})
     for values in samples:
-        _check_settings(with_values(run, values).settings())
+        with_values(run, values).settings()
     for name, distribution in space.distributions.items():
         for value in _extremes(distribution):
-            _check_settings(with_values(run, {**samples[0], name: value}).settings())
+            with_values(run, {**samples[0], name: value}).settings()
 
 
 def _check_names(space: Space, run: Run, names: Set[str]) -> None:
@@ -231,12 +229,3 @@ def _extremes(distribution: BaseDistribution) -> tuple[Any, ...]:
         return distribution.choices
     assert isinstance(distribution, (FloatDistribution, IntDistribution))
     return distribution.low, distribution.high
-
-
-def _check_settings(settings: Mapping[str, Any]) -> None:
-    kwargs = policy_kwargs_of(settings)
-    names = {field.name for field in fields(SparsityConfig)}
-    SparsityConfig(**{name: value for name, value in kwargs.items() if name in names})
-    arguments = find_callback(settings)
-    if arguments is not None:
-        SparsityCallback(**arguments)

@@ -69,11 +69,12 @@ class TrainingProgress(Watch):
 
     On something that is no terminal, a line every tenth of the run in place of the bar.
 
-    :param console: where to print
+    :param console: where to print; None: to standard output
     """
 
-    def __init__(self, console: Console) -> None:
+    def __init__(self, console: Console | None = None) -> None:
         super().__init__()
+        console = Console(highlight=False, markup=False) if console is None else console
         self.console = console
         self.folder: Path | None = None
         self.episodes = EpisodesProgress(console)

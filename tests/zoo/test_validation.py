@@ -7,10 +7,14 @@ import math
 import numpy as np
 import pytest
 import yaml
+from tuning_support import choices
 
 from sb3_sparse.callback import SparsityCallback
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.experiments import Study
+from sb3_sparse.tuning import Space
+from sb3_sparse.tuning.backend import optuna
+from sb3_sparse.tuning.spaces import check_space
 from sb3_sparse.zoo.arguments import kind_of
 from sb3_sparse.zoo.configs import METHODS, config_root, read_yaml
 from sb3_sparse.zoo.run import Run, algorithms
@@ -162,7 +166,7 @@ def test_every_shipped_entry_passes():
     assert checked > 200
 
 
-def test_the_same_table_serves_files_options_and_studies(tmp_path):
+def test_the_same_table_serves_files_options_studies_and_spaces(tmp_path):
     said = r"gamma must be a number in \[0, 1\]; got 5"
     config = tmp_path / "mine.yml"
     entry = {
@@ -184,6 +188,11 @@ def test_the_same_table_serves_files_options_and_studies(tmp_path):
     study.write_text(yaml.safe_dump(content))
     with pytest.raises(ConfigError, match=f"study.yml, scale smoke: {said}"):
         Study.read(str(study), "smoke")
+    with pytest.raises(ConfigError, match=said):
+        check_space(choices(gamma=[0.9, 5]), Run())
+    high = optuna.distributions.FloatDistribution(0.9, 5)
+    with pytest.raises(ConfigError, match=r"gamma must be a number in \[0, 1\]; got [1-5]\."):
+        check_space(Space("mine", {"gamma": high}), Run())
 
 
 @pytest.mark.parametrize(
