@@ -39,7 +39,7 @@ def test_train_says_what_it_does_and_enjoy_and_inspect_read_it(tmp_path):
     for step in (500, 1000, 1500):  # each evaluation is a line, also without a terminal
         line = rf"^evaluated at step {step}: return \d+\.\d ± \d+\.\d, best so far \d+\.\d$"
         assert re.search(line, done.stdout, re.MULTILINE)
-    assert "Evaluating the last policy: 2 episodes" in done.stdout
+    assert "Evaluating the last policy, episodes: 2" in done.stdout
     assert "Return over 2 episodes:" in done.stdout
     folder = Path("logs") / "dqn" / "CartPole-v1_1"
     for what, name in (("Last policy", "CartPole-v1.zip"), ("Best policy", "best_model.zip")):

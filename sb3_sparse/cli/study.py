@@ -90,8 +90,8 @@ def run(
         console.print(error, soft_wrap=True)
     console.print(f"{last.done} of {last.planned} runs are done.")
     if last.diverged:
-        console.print(f"{last.diverged} diverged, and are over; the report names them.")
-    if last.done:
+        console.print(f"Diverged, and not run again: {last.diverged}; the report names them.")
+    if last.done or last.diverged:
         console.print(
             f"Draw them: {_command('report', name, scale, store, packages)}", soft_wrap=True
         )

@@ -110,7 +110,7 @@ def _account(progress: Progress, cell: Cell, store: Path, ended: Ended, last: bo
         if last:
             progress.failed[cell.name] = ended.error
         return
-    progress.ended = cell.name
+    progress.ended = cell.name if ended.value != DIVERGED else f"{cell.name}, diverged"
     if ended.value in (DONE, DIVERGED):
         progress.done += ended.value == DONE
         progress.diverged += ended.value == DIVERGED

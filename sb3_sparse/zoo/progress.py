@@ -55,7 +55,7 @@ class EpisodesProgress:
         if what not in self.tasks:
             self.tasks[what] = self.progress.add_task(what, total=planned)
             if self.progress.disable:
-                self.progress.console.print(f"{what}: {planned} episodes")
+                self.progress.console.print(f"{what}, episodes: {planned}")
             self.progress.start()
         self.progress.update(self.tasks[what], completed=done)
 
