@@ -1,20 +1,27 @@
 """Sparse training for deep reinforcement learning, inside stock Stable-Baselines3.
 
-Importing the package registers ``SparsePolicy`` with every supported algorithm.
+Importing the package registers ``SparsePolicy`` with every supported algorithm. The command line
+alone, which answers ``--help`` before anybody needs torch, leaves that to the first module that
+does.
 """
 
 from __future__ import annotations
 
+import sys
+from importlib import import_module
 from importlib.metadata import version
-from typing import Any
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from sb3_sparse.callback import SparsityCallback
-from sb3_sparse.compress.twin import sparsify
-from sb3_sparse.policies.actor_critic import SparseActorCriticPolicy
-from sb3_sparse.policies.aliases import SparsePolicy, register_policies, supported_algorithms
-from sb3_sparse.policies.dqn import SparseDQNPolicy
-from sb3_sparse.policies.sac import SparseSACPolicy
-from sb3_sparse.policies.td3 import SparseTD3Policy
+if TYPE_CHECKING:
+    from sb3_sparse.callback import SparsityCallback
+    from sb3_sparse.compress.twin import sparsify
+    from sb3_sparse.policies.actor_critic import SparseActorCriticPolicy
+    from sb3_sparse.policies.aliases import SparsePolicy, supported_algorithms
+    from sb3_sparse.policies.dqn import SparseDQNPolicy
+    from sb3_sparse.policies.sac import SparseSACPolicy
+    from sb3_sparse.policies.td3 import SparseTD3Policy
 
 __version__ = version("sb3-sparse")
 __all__ = [
@@ -28,15 +35,37 @@ __all__ = [
     "supported_algorithms",
 ]
 _CONTRIB = ["SparseCrossQPolicy", "SparseQRDQNPolicy", "SparseTQCPolicy"]
-
-register_policies()
-if "TQC" in supported_algorithms():  # sb3-contrib is installed
+if find_spec("sb3_contrib"):
     __all__ += _CONTRIB
+_HOMES = {
+    "SparseActorCriticPolicy": "policies.actor_critic",
+    "SparseDQNPolicy": "policies.dqn",
+    "SparsePolicy": "policies.aliases",
+    "SparseSACPolicy": "policies.sac",
+    "SparseTD3Policy": "policies.td3",
+    "SparsityCallback": "callback",
+    "sparsify": "compress.twin",
+    "supported_algorithms": "policies.aliases",
+    **dict.fromkeys(_CONTRIB, "policies.contrib"),
+}
 
 
 def __getattr__(name: str) -> Any:
-    if name in _CONTRIB:
-        from sb3_sparse.policies import contrib
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+    globals()[name] = value
+    return value
 
-        return getattr(contrib, name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
+
+def _is_command_line() -> bool:
+    """Whether this process is ``sb3-sparse``, or ``python -m sb3_sparse.cli``."""
+    return Path(sys.argv[0]).stem == "sb3-sparse" or "sb3_sparse.cli" in sys.orig_argv
+
+
+if not _is_command_line():
+    import_module(f"{__name__}.policies.aliases")  # which registers the policies

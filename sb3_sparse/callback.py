@@ -7,7 +7,7 @@ import warnings
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_sparse.engine.plan import Plan
-from sb3_sparse.errors import ConfigError
+from sb3_sparse.errors import ConfigError, SparsityWarning
 from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.policies.mixin import SparsePolicyMixin
 from sb3_sparse.topology import method_named
@@ -142,6 +142,7 @@ class SparsityCallback(BaseCallback):
                 f"steps, and update_interval is {self.plan.update_interval}, with updates from "
                 f"{self.plan.begin:.0%} to {self.plan.end:.0%} of training; train longer or choose "
                 "a smaller one",
+                SparsityWarning,
                 stacklevel=2,
             )
 

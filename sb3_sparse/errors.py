@@ -27,6 +27,10 @@ class SparsityError(Exception):
     """Base of every error that this package raises on purpose."""
 
 
+class SparsityWarning(UserWarning):
+    """Training goes on, but perhaps not as you meant it; the message says what to change."""
+
+
 class ConfigError(SparsityError, ValueError):
     """A value is outside of what is allowed; the message says what is."""
 

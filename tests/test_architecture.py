@@ -12,7 +12,7 @@ PACKAGE = ROOT / "sb3_sparse"
 
 # From the top; parts on one line may not import each other either.
 FLOORS = [
-    {"cli"},
+    {"cli", "rl_zoo_optimize"},
     {"report", "experiments", "tuning"},
     {"zoo", "analysis", "export", "compress", "launch"},
     {"callback"},
@@ -35,7 +35,7 @@ EDGES = {
     "sb3_contrib": {"policies"},
     "typer": {"cli"},
     "rich": {"cli", "zoo"},
-    "rl_zoo3": {"zoo"},
+    "rl_zoo3": {"zoo", "rl_zoo_optimize"},
     "optuna": {"tuning"},
     "matplotlib": {"report"},
     "rliable": {"report"},

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+import warnings
 import zipfile
 from pathlib import Path
 
@@ -259,3 +260,18 @@ def test_the_core_works_without_any_extra(tmp_path):
         [sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
+
+
+def test_our_warnings_are_one_line_without_code_and_others_are_as_they_were(capsys):
+    from sb3_sparse.cli import _show_ours_alone
+    from sb3_sparse.errors import SparsityWarning
+
+    others: list[str] = []
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
+        warnings.showwarning = lambda message, *_: others.append(str(message))
+        _show_ours_alone()
+        warnings.warn("update_interval is [odd]", SparsityWarning, stacklevel=1)
+        warnings.warn("theirs", UserWarning, stacklevel=1)
+    assert capsys.readouterr().err == "Warning: update_interval is [odd]\n"
+    assert others == ["theirs"]

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_sparse.engine.network import SparseNetwork
-from sb3_sparse.errors import CorruptStateError
+from sb3_sparse.errors import CorruptStateError, SparsityWarning
 from sb3_sparse.loading.arrays import read_arrays
 from sb3_sparse.loading.guard import reading
 
@@ -42,6 +42,7 @@ class MaskHistory:
         if path is not None and timesteps:
             warnings.warn(
                 f"{path} is not there, so exploration rates count from step {timesteps} on",
+                SparsityWarning,
                 stacklevel=2,
             )
         for layer in self._layers():

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import sys
+import warnings
+from typing import Any
 
-from sb3_sparse.errors import MissingExtra, SparsityError
+from sb3_sparse.errors import MissingExtra, SparsityError, SparsityWarning
 
 try:
     import typer
@@ -36,10 +38,29 @@ app.add_typer(tuning, name="tune", help="Search hyperparameters with Optuna, and
 app.add_typer(studies, name="study", help="Run and report whole comparisons, as the paper's.")
 
 
+def _show_ours_alone() -> None:
+    """Show our own warnings without the line of code that they come from, which says nothing here.
+
+    The change ends with ``warnings.catch_warnings``.
+    """
+    show = warnings.showwarning
+
+    def shown(message: Any, category: type[Warning], *where: Any, **more: Any) -> None:
+        if not issubclass(category, SparsityWarning):
+            return show(message, category, *where, **more)
+        Console(stderr=True, highlight=False).print(
+            f"Warning: {message}", markup=False, soft_wrap=True
+        )
+
+    warnings.showwarning = shown
+
+
 def main() -> None:
     """Run the command line; a user's mistake is one line on stderr and exit code 2."""
     try:
-        app(standalone_mode=True)
+        with warnings.catch_warnings():
+            _show_ours_alone()
+            app(standalone_mode=True)
     except (SparsityError, OSError) as error:
         Console(stderr=True, highlight=False).print(f"Error: {error}", markup=False, soft_wrap=True)
         sys.exit(2)

@@ -17,7 +17,6 @@ from sb3_sparse.cli.common import (
     print_score,
     text,
 )
-from sb3_sparse.zoo.inspect import inspect_model
 
 
 def enjoy(
@@ -65,4 +64,6 @@ def inspect(
     model: Annotated[Path, typer.Argument(help="A run's folder, or a model saved by SB3 (.zip).")],
 ) -> None:
     """Print the layers of a saved sparse model, and how they are best computed on this machine."""
+    from sb3_sparse.zoo.inspect import inspect_model
+
     console.print(str(inspect_model(model)), soft_wrap=True)

@@ -31,17 +31,12 @@ Store = Annotated[Path, text("Where runs and reports go; studies share it.", "--
 @studies.command("list")
 def list_() -> None:
     """Every study that comes with the package."""
-    from sb3_sparse.experiments import Study, study_names
-    from sb3_sparse.experiments.spec import SCALES
+    from sb3_sparse.experiments.blocks import SCALES, planned_runs, study_names, title_of
 
     table = Table("study", "what", *SCALES, box=None, header_style="bold")
     for name in study_names():
-        try:
-            scales = [Study.read(name, scale) for scale in SCALES]
-        except MissingExtra as error:
-            table.add_row(name, str(error))
-            continue
-        table.add_row(name, scales[0].title, *(str(len(study.cells)) for study in scales))
+        runs = planned_runs(name)
+        table.add_row(name, title_of(name), *(str(runs[scale]) for scale in SCALES))
     console.print(table)
     console.print("Numbers are runs. Go on with: sb3-sparse study run NAME --scale SCALE")
 
@@ -57,11 +52,13 @@ def run(
     gym_packages: GymPackages = None,
 ) -> None:
     """Train what a study lacks. What is done stays done; the same command goes on."""
-    from sb3_sparse.experiments import Study, run_study
-    from sb3_sparse.launch import launcher_named
+    from sb3_sparse.experiments import Study
 
     packages = gym_packages or []
     study = Study.read(name, scale, packages)
+    from sb3_sparse.experiments import run_study  # not for a mistyped name
+    from sb3_sparse.launch import launcher_named
+
     if Path(name).suffix:
         _check_figures(study)
     _say_merged(study)

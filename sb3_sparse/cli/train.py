@@ -29,7 +29,6 @@ from sb3_sparse.cli.common import (
     values_and_packages,
 )
 from sb3_sparse.errors import ConfigError, command
-from sb3_sparse.zoo.progress import TrainingProgress
 from sb3_sparse.zoo.run import Run
 from sb3_sparse.zoo.settings import method_of, parse_overrides
 
@@ -67,33 +66,39 @@ def train(
     ] = None,
 ) -> None:
     """Train, evaluate and save a sparse policy. Without arguments: DQN, RigL, 90 %, CartPole-v1."""
-    from sb3_sparse.zoo import train as engine  # rl_zoo3 takes its time to import
+    run = None
+    if resume is not None:
+        _refuse_other_options(context)
+    else:
+        values, packages = values_and_packages(context.args, hyperparams, gym_packages)
+        run = Run(
+            algo=algo.lower(),
+            env_id=env,
+            method=method,
+            sparsity=sparsity,
+            distribution=distribution,
+            match_params=match_params,
+            seed=seed,
+            n_timesteps=n_timesteps,
+            n_envs=n_envs,
+            hyperparams=parse_overrides(values),
+            conf_file=conf_file,
+            eval_freq=eval_freq,
+            eval_episodes=eval_episodes,
+            device=device,
+            gym_packages=tuple(packages),
+        )
+        run.config_entry()  # a mistyped name shall not wait for torch
+    from sb3_sparse.zoo import train as engine
+    from sb3_sparse.zoo.progress import TrainingProgress
 
     progress = TrainingProgress(console)
     try:
-        if resume is not None:
-            _refuse_other_options(context)
+        if run is None:
+            assert resume is not None
             console.print(f"Going on with {resume}", soft_wrap=True)
             outcome = engine.resume(resume, watch=progress)
         else:
-            values, packages = values_and_packages(context.args, hyperparams, gym_packages)
-            run = Run(
-                algo=algo.lower(),
-                env_id=env,
-                method=method,
-                sparsity=sparsity,
-                distribution=distribution,
-                match_params=match_params,
-                seed=seed,
-                n_timesteps=n_timesteps,
-                n_envs=n_envs,
-                hyperparams=parse_overrides(values),
-                conf_file=conf_file,
-                eval_freq=eval_freq,
-                eval_episodes=eval_episodes,
-                device=device,
-                gym_packages=tuple(packages),
-            )
             console.print(_headline(run))
             outcome = engine.train(run, log_folder, tensorboard_log=tensorboard_log, watch=progress)
     except KeyboardInterrupt:

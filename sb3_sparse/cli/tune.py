@@ -109,11 +109,6 @@ def search(
 
     The same command goes on with an interrupted study, and on another machine joins it.
     """
-    from sb3_sparse.launch import launcher_named
-    from sb3_sparse.tuning import tune
-    from sb3_sparse.tuning.best import check_target
-    from sb3_sparse.tuning.best import write_into as merge
-
     values, packages = values_and_packages(context.args, hyperparams, gym_packages)
     run = Run(
         algo=algo.lower(),
@@ -131,6 +126,12 @@ def search(
         device=device,
         gym_packages=tuple(packages),
     )
+    run.config_entry()  # a mistyped name shall not wait for torch
+    from sb3_sparse.launch import launcher_named
+    from sb3_sparse.tuning import tune
+    from sb3_sparse.tuning.best import check_target
+    from sb3_sparse.tuning.best import write_into as merge
+
     if write_into is not None:
         check_target(run, write_into)
     progress = TuningProgress(console)

@@ -13,7 +13,7 @@ from stable_baselines3.common.distributions import StateDependentNoiseDistributi
 from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
-from sb3_sparse.errors import CorruptStateError, UnsupportedError
+from sb3_sparse.errors import UnsupportedError
 from sb3_sparse.export.graph import Graph
 from sb3_sparse.export.nodes import Affine, Argmax, Clip, Linear, Positive
 from sb3_sparse.export.preprocess import observed, preprocessed
@@ -21,7 +21,6 @@ from sb3_sparse.export.trace import Tracer
 from sb3_sparse.loading.zips import check_finite
 from sb3_sparse.policies.aliases import supported_algorithms
 from sb3_sparse.policies.compiled import unwrapped
-from sb3_sparse.policies.mixin import SparsePolicyMixin
 
 
 def graph_of(model: BaseAlgorithm, normalization: VecNormalize | None) -> Graph:
@@ -89,16 +88,6 @@ def check_model(model: BaseAlgorithm) -> None:
             raise UnsupportedError(
                 f"{name} is of {parameter.dtype}, and SB3 gives a policy float32 only: "
                 "model.predict fails, too. Call policy.float() before the export"
-            )
-    if not isinstance(policy, SparsePolicyMixin):
-        return
-    for layer in policy.sparse.layers:
-        wrong = int(np.count_nonzero(layer.dense()[~layer.mask()]))
-        if wrong:
-            raise CorruptStateError(
-                f"masks and weights disagree: {wrong} connections of {layer.name} are not 0 though "
-                "its mask has them inactive, as after somebody wrote the weights; "
-                "policy.load_state_dict masks what it loads"
             )
 
 

@@ -119,7 +119,7 @@ def export(
     :raises ConfigError: for a value that is not allowed
     :raises UnsupportedError: for an algorithm, network or space that cannot be exported, or where
         there is no C compiler to check with
-    :raises CorruptStateError: if masks and weights disagree, or weights are not finite
+    :raises CorruptStateError: if weights are not finite
     :raises ParityError: if it does not act as the model: continuous actions that differ by more
         than 1e-5, relative to those above 1 and to the range that they are squashed into, or a
         discrete action that differs

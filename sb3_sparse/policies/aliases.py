@@ -75,3 +75,6 @@ def register_policies() -> None:
     _register(TRPO, actor_critic, "SparseActorCritic")
     for unsupported in (ARS, MaskablePPO, RecurrentPPO):
         _refuse(unsupported)
+
+
+register_policies()

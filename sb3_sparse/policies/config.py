@@ -17,7 +17,8 @@ COMPUTE = ("masked", "sparse", "auto")
 SPARSITY_MISSING = (
     "a sparse policy needs its sparsity, e.g. policy_kwargs=dict(sparsity=0.9): the removed "
     "fraction of connections, in [0, 1). There is no default, so that a lost value cannot train "
-    "dense"
+    "dense (rl_zoo3.train -optimize loses it unless you add --gym-packages "
+    "sb3_sparse.rl_zoo_optimize)"
 )
 
 

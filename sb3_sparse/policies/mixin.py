@@ -25,6 +25,7 @@ from sb3_sparse.policies.config import SparsityConfig
 from sb3_sparse.policies.extractors import choose_extractor, copied_modules
 from sb3_sparse.policies.named import import_named
 from sb3_sparse.policies.parts import without_graphs
+from sb3_sparse.policies.randomness import peek_seed
 from sb3_sparse.policies.report import SparsityReport, report_on
 from sb3_sparse.policies.spec import NetworkSpec
 from sb3_sparse.policies.storage import may_compact
@@ -278,13 +279,6 @@ class SparsePolicyMixin(BasePolicy):
         if hasattr(self, "share_features_extractor"):  # SB3 forgets it for some of its policies
             data["share_features_extractor"] = self.share_features_extractor
         return data
-
-
-def peek_seed() -> int:
-    """The next number of torch's global generator, which is left where it is."""
-    generator = th.Generator()
-    generator.set_state(th.get_rng_state())
-    return int(th.randint(2**63 - 1, (), generator=generator))
 
 
 def with_extractor(

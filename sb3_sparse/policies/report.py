@@ -123,6 +123,7 @@ def report_on(policy: SparsePolicyMixin) -> SparsityReport:
     positions = _conv_positions(policy)
     activated = _activated(policy)
     layers = []
+    counted: set[int] = set()
     for network in policy.sparse.networks:
         kernels: list[tuple[str, Kernel, tuple[int, ...], int, bool]] = [
             (layer.name, layer.module, layer.shape, layer.nnz, True) for layer in network.layers
@@ -132,6 +133,7 @@ def report_on(policy: SparsePolicyMixin) -> SparsityReport:
             for name, module in network.dense_kernels
         ]
         for name, module, shape, nnz, in_budget in kernels:
+            counted.add(id(module.weight))
             biases = 0 if module.bias is None else module.bias.numel()
             units = shape[0] if id(module) in activated else 0
             places = positions.get(id(module), 1)
@@ -147,26 +149,25 @@ def report_on(policy: SparsePolicyMixin) -> SparsityReport:
                     in_budget=in_budget,
                 )
             )
-    return SparsityReport((*layers, *_other_matrices(policy, {r.name for r in layers})))
+    return SparsityReport((*layers, *_other_matrices(policy, counted)))
 
 
-def _other_matrices(policy: SparsePolicyMixin, names: set[str]) -> list[LayerReport]:
+def _other_matrices(policy: SparsePolicyMixin, counted: set[int]) -> list[LayerReport]:
     """Trained matrices that belong to no Linear or Conv layer, which are dense: embeddings, say.
 
     A ``log_std`` is no connection, and targets do not count.
 
-    :param names: of the layers that are in the report already
+    :param counted: ids of the weights that are in the report already
     """
     specs: Mapping[str, NetworkSpec] = getattr(policy, "networks", {})
     targets = tuple(f"{spec.target}." for spec in specs.values() if spec.target is not None)
     found = []
     for name, parameter in policy.named_parameters() if specs else ():
-        owner, _, own_name = name.rpartition(".")
         if (
             parameter.dim() < 2
             or not parameter.requires_grad
-            or owner in names
-            or own_name == "log_std"
+            or id(parameter) in counted
+            or name.rpartition(".")[2] == "log_std"
             or name.startswith(targets)
         ):
             continue

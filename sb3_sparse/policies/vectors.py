@@ -12,7 +12,7 @@ from torch import nn
 
 from sb3_sparse.engine.linear import CompactLinear
 from sb3_sparse.engine.masked import MaskedLayer
-from sb3_sparse.errors import ConfigError
+from sb3_sparse.errors import ConfigError, SparsityWarning
 
 
 def to_vector(root: nn.Module) -> NDArray[np.float32]:
@@ -69,6 +69,7 @@ def from_vector(root: nn.Module, vector: NDArray[Any]) -> None:
         warnings.warn(
             f"{dropped} of the vector's values belong to inactive connections and were dropped; "
             "what is inactive stays 0",
+            SparsityWarning,
             stacklevel=3,
         )
 

@@ -16,6 +16,7 @@ from optuna.storages._heartbeat import BaseHeartbeat
 from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
 from optuna.storages.journal._file import get_lock_file
 
+from sb3_sparse.errors import SparsityWarning
 from sb3_sparse.tuning.backend import BaseStorage, FrozenTrial, TrialState
 from sb3_sparse.tuning.queue import FromQueue, StaleCallback
 
@@ -74,6 +75,7 @@ class JournalFile(JournalFileBackend):
             f"the last line of the journal {self.path} was not written to its end, as after a "
             f"power cut or on a full disk; its {len(tail)} bytes are in {aside} now, and the study "
             "goes on without them",
+            SparsityWarning,
             stacklevel=4,
         )
 

@@ -18,9 +18,10 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_sparse.errors import MissingExtra
+from sb3_sparse.errors import MissingExtra, SparsityWarning
 from sb3_sparse.policies.saving import load_without_buffer
 from sb3_sparse.zoo.checkpoint import REPLAY_BUFFER
+from sb3_sparse.zoo.mujoco import mujoco_warns_once
 from sb3_sparse.zoo.record import write_record
 from sb3_sparse.zoo.replay import end_episodes, restore_buffer
 from sb3_sparse.zoo.run import Run
@@ -97,7 +98,8 @@ class Experiment(ExperimentManager):
         training alone.
         """
         self.eval_env_kwargs = self.env_kwargs
-        envs: VecEnv = super().create_envs(n_envs, eval_env, no_log or self.trained)
+        with mujoco_warns_once(self.env_name.gym_id):
+            envs: VecEnv = super().create_envs(n_envs, eval_env, no_log or self.trained)
         return envs
 
     def setup(self) -> BaseAlgorithm:
@@ -116,6 +118,7 @@ class Experiment(ExperimentManager):
             warnings.warn(
                 f"there is no replay buffer in {folder}: the run goes on with an empty one, which "
                 "trains otherwise than an uninterrupted run",
+                SparsityWarning,
                 stacklevel=2,
             )
             write_record(Path(self.save_path), without_buffer_from=model.num_timesteps)

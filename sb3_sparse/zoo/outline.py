@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from hashlib import sha256
 from typing import Any
 
 import torch as th
@@ -120,18 +121,24 @@ def _kernels(state: Mapping[str, Any], specs: Mapping[str, NetworkSpec]) -> dict
         if key.endswith(WEIGHT) and isinstance(value, th.Tensor) and 2 <= value.dim() <= 5
     ]
     found: dict[str, str] = {}
-    seen: set[int] = set()
+    seen: set[tuple[str, bytes]] = set()
     for network, spec in specs.items():
         for root in spec.roots:
             for name in names:
-                place = state[name + WEIGHT].data_ptr()  # shared weights are saved once
-                if _below(name + WEIGHT, (root,)) and place not in seen:
-                    seen.add(place)
+                if _below(name + WEIGHT, (root,)) and (one := _identity(state, name)) not in seen:
+                    seen.add(one)
                     found[name] = network
     for name in names:  # of a policy with networks of its own
-        if name + MASK in state and state[name + WEIGHT].data_ptr() not in seen:
+        if name + MASK in state and _identity(state, name) not in seen:
             found[name] = name.split(".")[0]
     return {name: one for name, one in found.items() if not name.startswith(targets or ("\0",))}
+
+
+def _identity(state: Mapping[str, Any], name: str) -> tuple[str, bytes]:
+    """What a layer of a shared features extractor has in common under all of its names."""
+    within = name.rpartition("features_extractor.")[2]  # the whole name of any other layer
+    weight = state[name + WEIGHT].detach().contiguous()
+    return within, sha256(weight.numpy().tobytes()).digest()
 
 
 def _activated(name: str, state: Mapping[str, Any], specs: Mapping[str, NetworkSpec]) -> bool:

@@ -6,13 +6,12 @@ from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_sparse.errors import ConfigError, did_you_mean
-from sb3_sparse.policies.aliases import supported_algorithms
+from sb3_sparse.policies.names import algorithm_names
 from sb3_sparse.sparsity.distributions import check_distribution, check_sparsity
 from sb3_sparse.zoo.arguments import MAPPING, Kind, is_whole
 from sb3_sparse.zoo.configs import config_path, entry_of, evaluation_of
@@ -24,7 +23,9 @@ from sb3_sparse.zoo.environments import (
     plain_id,
 )
 from sb3_sparse.zoo.settings import apply_overrides, method_of, policy_kwargs_of
-from sb3_sparse.zoo.validation import check_settings
+
+if TYPE_CHECKING:  # which is imported when settings are checked, not when a run is named
+    from stable_baselines3.common.base_class import BaseAlgorithm
 
 DENSE = "dense"
 _TEXT = Kind("a text", lambda v: isinstance(v, str))
@@ -85,11 +86,11 @@ class Run:
         for one in fields(self):  # NumPy's numbers, which no JSON takes, become Python's
             object.__setattr__(self, one.name, plain(getattr(self, one.name)))
         self._check_types()
-        if self.algo not in algorithms():
+        known = [name.lower() for name in algorithm_names()]
+        if self.algo not in known:
             raise ConfigError(
-                f"unknown algorithm {self.algo!r}{did_you_mean(self.algo, algorithms())}; allowed "
-                f"are {', '.join(algorithms())} (tqc, qrdqn, crossq and trpo need "
-                "sb3-sparse[contrib])"
+                f"unknown algorithm {self.algo!r}{did_you_mean(self.algo, known)}; allowed are "
+                f"{', '.join(known)} (tqc, qrdqn, crossq and trpo need sb3-sparse[contrib])"
             )
         env_id, packages = plain_id(self.env_id, package_names(self.gym_packages))
         object.__setattr__(self, "env_id", env_id)
@@ -165,6 +166,8 @@ class Run:
                 f"--match-params is for --method dense, not {method!r}: it trains the dense "
                 "network that has as many parameters as the sparse one"
             )
+        from sb3_sparse.zoo.validation import check_settings
+
         wanted = {
             name: getattr(self, name)
             for name in ("sparsity", "distribution", "n_timesteps", "n_envs")
@@ -216,4 +219,6 @@ def _is_path(text: str) -> bool:
 
 def algorithms() -> dict[str, type[BaseAlgorithm]]:
     """Supported algorithms by lower-case name."""
+    from sb3_sparse.policies.aliases import supported_algorithms
+
     return {name.lower(): algorithm for name, algorithm in supported_algorithms().items()}

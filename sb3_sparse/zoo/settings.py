@@ -7,18 +7,18 @@ import inspect
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from stable_baselines3.common.base_class import BaseAlgorithm
-
-from sb3_sparse.callback import SparsityCallback
 from sb3_sparse.errors import ConfigError, did_you_mean
-from sb3_sparse.policies.aliases import SparsePolicy
 from sb3_sparse.policies.named import import_path
 from sb3_sparse.topology import method_named
 
-POLICY = f"sb3_sparse.{SparsePolicy}"
-CALLBACK = f"sb3_sparse.{SparsityCallback.__name__}"
+if TYPE_CHECKING:  # which is imported when settings are checked, not when names are read
+    from stable_baselines3.common.base_class import BaseAlgorithm
+
+POLICY = "sb3_sparse.SparsePolicy"
+ALIAS = "SparsePolicy"
+CALLBACK = "sb3_sparse.SparsityCallback"
 # What rl-zoo reads itself, beside the arguments of the algorithm's constructor.
 ZOO_KEYS = frozenset(
     ("callback", "env_kwargs", "env_wrapper", "frame_stack", "monitor_kwargs", "n_envs")
@@ -83,9 +83,11 @@ class Names:
     @classmethod
     def of(cls, algorithm: type[BaseAlgorithm]) -> Names:
         """Those that go with an algorithm."""
+        from sb3_sparse.callback import SparsityCallback
+
         return cls(
             (_arguments(algorithm) - SET_BY_THE_ENGINE) | ZOO_KEYS,
-            _arguments(algorithm.policy_aliases[SparsePolicy]),
+            _arguments(algorithm.policy_aliases[ALIAS]),
             _arguments(SparsityCallback) - {"method", "verbose"},
         )
 
@@ -163,10 +165,11 @@ def find_callback(settings: Mapping[str, Any]) -> dict[str, Any] | None:
 def has_own_callback(settings: Mapping[str, Any]) -> bool:
     """Whether the callback is a subclass of the user's, which may take other arguments."""
     found = _our_callback(settings)
-    return found is not None and found[0] is not SparsityCallback
+    return found is not None and found[0]
 
 
-def _our_callback(settings: Mapping[str, Any]) -> tuple[type[Any], dict[str, Any]] | None:
+def _our_callback(settings: Mapping[str, Any]) -> tuple[bool, dict[str, Any]] | None:
+    """Whether the callback is a subclass of the user's, and its arguments."""
     callbacks = settings.get("callback") or []
     for callback in callbacks if isinstance(callbacks, list) else [callbacks]:
         named = callback if isinstance(callback, dict) else {callback: {}}
@@ -175,22 +178,28 @@ def _our_callback(settings: Mapping[str, Any]) -> tuple[type[Any], dict[str, Any
                 f"a callback is one path, with its arguments indented below it, got {callback!r}"
             )
         ((path, arguments),) = named.items()
-        found = _callback_class(path)
-        if found is not None:
+        own = _is_own(path)
+        if own is not None:
             if not isinstance(arguments, dict) or "method" not in arguments:
                 raise ConfigError(f"{path} needs a method, e.g. {path}: {{method: rigl}}")
-            return found, arguments
+            return own, arguments
     return None
 
 
-def _callback_class(path: object) -> type[Any] | None:
+def _is_own(path: object) -> bool | None:
+    """Whether a path names a subclass of SparsityCallback; None: neither that nor itself."""
     if not isinstance(path, str):
         raise ConfigError(f"a callback is a dotted path, e.g. {CALLBACK}, got {path!r}")
+    if path == CALLBACK:
+        return False
+    from sb3_sparse.callback import SparsityCallback
+
     try:
         found = import_path(path)
     except ImportError:
         return None  # rl-zoo says so when it imports it
-    return found if isinstance(found, type) and issubclass(found, SparsityCallback) else None
+    ours = isinstance(found, type) and issubclass(found, SparsityCallback)
+    return found is not SparsityCallback if ours else None
 
 
 def method_of(settings: Mapping[str, Any]) -> str:
@@ -199,7 +208,7 @@ def method_of(settings: Mapping[str, Any]) -> str:
     :raises ConfigError: if their policy is not sparse, or they say contradictory things
     """
     policy = settings.get("policy")
-    if policy not in (POLICY, SparsePolicy):
+    if policy not in (POLICY, ALIAS):
         raise ConfigError(
             f"the policy must be {POLICY} (with sparsity 0.0 for dense training), got {policy!r}"
         )

@@ -7,7 +7,7 @@ import yaml
 
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.experiments import Study, study_names
-from sb3_sparse.experiments.spec import SCALES
+from sb3_sparse.experiments.blocks import SCALES
 
 MINIMAL = {
     "title": "A title",

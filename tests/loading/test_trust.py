@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 import torch as th
+from stable_baselines3.common.env_util import make_vec_env
 from support import ALGORITHMS, make
 
 from sb3_sparse import cli
@@ -148,7 +149,9 @@ NARROW = {
         ("SAC", None, {"use_sde": True}),
         ("PPO", None, {"net_arch": []}),
         ("PPO", "TinyDicts-v0", {}),
+        ("PPO", "TinyImages-v0", {}),
         ("PPO", "TinyImages-v0", {"share_features_extractor": False}),
+        ("SAC", "TinyImages-v0", {"share_features_extractor": True}),
         ("DQN", "TinyImages-v0", {}),
         ("DQN", "TinyImages-v0", IMPALA),
         ("DQN", "TinyImages-v0", NARROW),
@@ -157,7 +160,9 @@ NARROW = {
 def test_what_is_told_by_names_and_shapes_is_the_policys_own_report(
     algorithm, env, kwargs, tmp_path
 ):
-    model = make(algorithm, env, policy_kwargs=kwargs)
+    discrete = algorithm in ("DQN", "PPO")
+    made = None if env is None else make_vec_env(env, env_kwargs={"discrete": discrete})
+    model = make(algorithm, made, policy_kwargs=kwargs)
     model.save(tmp_path / "model.zip")
     found = inspect_model(tmp_path / "model.zip")
     assert found.report == model.policy.sparsity_report()

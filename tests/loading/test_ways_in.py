@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import stat
 import sys
@@ -238,9 +237,3 @@ def test_looking_at_a_study_writes_nothing(tmp_path, run_command):
     code, out, err = run_command("study", "report", study, "-f", store, "-o", tmp_path / "page")
     assert code == 0, err
     assert "sparsity.json is damaged" in (tmp_path / "page" / "index.html").read_text()
-
-
-def test_the_caches_place_need_not_be_writable(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", os.devnull)
-    make("SAC", policy_kwargs={"net_arch": [200, 200]}).save(tmp_path / "model.zip")
-    assert inspect_model(tmp_path / "model.zip").choice.batch == 16

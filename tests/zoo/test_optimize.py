@@ -39,7 +39,7 @@ def optimize(algo, config, cwd, *more):
 @pytest.mark.parametrize("algo", sorted(ENVS))
 def test_each_trial_trains_with_the_configs_sparsity(algo, tmp_path):
     config = CONFIG.format(env=ENVS[algo])
-    done = optimize(algo, config, tmp_path, "--gym-packages", "sb3_sparse.zoo")
+    done = optimize(algo, config, tmp_path, "--gym-packages", "sb3_sparse.rl_zoo_optimize")
     assert done.returncode == 0, done.stderr
     models = sorted(tmp_path.glob("trials/trial_*/best_model.zip"))
     assert len(models) == 2
@@ -58,7 +58,7 @@ def test_without_it_the_sparsity_is_missed_and_a_stock_policy_is_left_alone(tmp_
     assert "a sparse policy needs its sparsity" in done.stderr + done.stdout
     stock = "CartPole-v1:\n  n_timesteps: 300\n  policy: MlpPolicy\n"
     stock += "  policy_kwargs: {net_arch: [17], normalize_images: False}\n"
-    done = optimize("dqn", stock, tmp_path, "--gym-packages", "sb3_sparse.zoo")
+    done = optimize("dqn", stock, tmp_path, "--gym-packages", "sb3_sparse.rl_zoo_optimize")
     assert done.returncode == 0, done.stderr
     model = DQN.load(tmp_path / "trials" / "trial_0" / "best_model.zip")
     assert model.policy_kwargs.keys() == {"net_arch"}  # replaced, as rl-zoo does

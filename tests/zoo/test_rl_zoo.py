@@ -45,7 +45,7 @@ def assert_sparse(model, sparsity: float = 0.9) -> None:
     assert abs(model.policy.sparse.sparsity - sparsity) < 0.01
     for layer in model.policy.sparse.layers:
         assert layer.nnz == layer.final_nnz
-        assert not layer.weight[~layer.module.weight_mask].any()
+        assert not layer.dense()[~layer.mask()].any()
 
 
 def test_sac_trains_saves_checkpoints_goes_on_and_can_be_enjoyed(tmp_path):

@@ -1,8 +1,9 @@
 """``rl_zoo3.train -optimize`` keeps the policy's arguments that a config gives.
 
 Its samplers draw a ``policy_kwargs`` of their own, which replaces the config's as a whole, so that
-a sparse policy would lose its sparsity. Importing :mod:`sb3_sparse.zoo`, as ``--gym-packages
-sb3_sparse.zoo`` does, puts the config's below the sampled ones; stock policies stay as they are.
+a sparse policy would lose its sparsity. Importing this module, as ``--gym-packages
+sb3_sparse.rl_zoo_optimize`` does, puts the config's below the sampled ones; stock policies stay as
+they are. Nothing else of this package imports it.
 """
 
 from __future__ import annotations
@@ -54,3 +55,6 @@ def _keeping(sampler: Sampler) -> Sampler:
         return sampled
 
     return keeping
+
+
+keep_policy_kwargs()

@@ -1,0 +1,153 @@
+"""The blocks of a study's YAML file, and the runs that they stand for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from copy import deepcopy
+from dataclasses import fields
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+from sb3_sparse.errors import ConfigError, did_you_mean
+from sb3_sparse.zoo.configs import read_yaml
+from sb3_sparse.zoo.run import Run
+
+SHIPPED = Path(__file__).parent / "studies"
+SCALES = ("smoke", "small", "paper")
+KEYS = {"title", "figures", "varies", "common", "runs", "scales", "measures", "trained"}
+RUN_KEYS = {one.name for one in fields(Run)} - {"seed", "device", "entry"}
+CHOSEN = ("sparsity", "match_params", "method", "distribution", "algo")
+"""What a scale chooses among a block's own values."""
+VARY, SEEDS, MEASURES, SCHEDULE = "vary", "seeds", "measures", "schedule"
+PACKAGES = "gym_packages"
+
+
+def study_names() -> list[str]:
+    """The names of the studies that come with the package."""
+    return sorted(path.stem for path in SHIPPED.glob("*.yml"))
+
+
+def path_of(what: str) -> Path:
+    """The file of a study.
+
+    :raises ConfigError: if there is no such study
+    """
+    path = Path(what)
+    if path.suffix not in (".yml", ".yaml"):
+        path = SHIPPED / f"{what}.yml"
+        if not path.is_file():
+            raise ConfigError(
+                f"unknown study {what!r}{did_you_mean(what, study_names())}; allowed are "
+                f"{', '.join(study_names())}, or a file of your own, .yml (docs/studies.md)"
+            )
+    return path
+
+
+def planned_runs(name: str) -> dict[str, int]:
+    """How many runs a shipped study has at each scale, counted without looking at their settings.
+
+    :param name: one of :func:`study_names`
+    """
+    content = read_yaml(path_of(name), "title, figures, runs and scales")
+    return {
+        scale: int((of_scale or {}).get(SEEDS, 1)) * len(planned_arguments(content, of_scale or {}))
+        for scale, of_scale in content["scales"].items()
+    }
+
+
+def title_of(name: str) -> str:
+    """The title of a shipped study."""
+    return str(read_yaml(path_of(name), "title, figures, runs and scales")["title"])
+
+
+def planned_arguments(content: Mapping[str, Any], scale: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Arguments of the runs of one seed."""
+    own = {key: value for key, value in scale.items() if key not in (SEEDS, MEASURES, SCHEDULE)}
+    common = content.get("common", {})
+    return [one for block in content["runs"] for one in _grid(block_of(common, block, own))]
+
+
+def check_keys(given: Any, allowed: set[str], where: str) -> None:
+    """Refuse what is no mapping, and keys that mean nothing.
+
+    :raises ConfigError: if so
+    """
+    if not isinstance(given, Mapping):
+        raise ConfigError(f"{where} must be a mapping, got {given!r}")
+    unknown = [str(key) for key in given if key not in allowed]
+    if unknown:
+        nearest = did_you_mean(unknown[0], allowed)
+        raise ConfigError(
+            f"{where} has unknown keys {', '.join(unknown)}{nearest}; allowed are "
+            f"{', '.join(sorted(allowed))}"
+        )
+
+
+def block_of(common: Any, block: Any, scale: Mapping[str, Any]) -> dict[str, Any]:
+    """A block of runs as a scale has it.
+
+    ``hyperparams`` add up. What a scale says of sparsities, methods or what is varied goes to
+    those blocks alone that speak of it; all else goes to every block.
+    """
+    for given, where in ((common, "common"), (block, "a block of runs")):
+        check_keys(given, RUN_KEYS | {VARY}, where)
+    for part in (common, block, scale):
+        if not isinstance(part.get("hyperparams") or {}, Mapping):
+            raise ConfigError(
+                f"hyperparams must be a mapping, e.g. gamma: 0.98, got {part['hyperparams']!r}"
+            )
+    made: dict[str, Any] = deepcopy({**common, **block})
+    check_lists(made.get(VARY, {}))
+    made["hyperparams"] = {
+        name: value
+        for part in (common, block, scale)
+        for name, value in (part.get("hyperparams") or {}).items()
+    }
+    for key, value in scale.items():
+        if key == VARY:
+            known = made.get(VARY, {})
+            made[VARY] = {**known, **{name: value[name] for name in known if name in value}}
+        elif key in CHOSEN:
+            made[key] = _kept(made[key], value) if key in made else None
+        elif key != "hyperparams":
+            made[key] = value
+    return {key: value for key, value in made.items() if value is not None}
+
+
+def _kept(of_block: Any, of_scale: Any) -> Any:
+    """What a scale leaves of a block's values: those that both have."""
+    wanted = as_list(of_scale)
+    return [value for value in as_list(of_block) if value in wanted]
+
+
+def _grid(block: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """Every combination of the lists in a block, and of what it varies."""
+    varied = block.pop(VARY, {})
+    hyperparams = block.pop("hyperparams", {})
+    lists = {key: [value] if key == PACKAGES else as_list(value) for key, value in block.items()}
+    for values in product(*lists.values()):
+        for chosen in product(*varied.values()):
+            yield {
+                **dict(zip(lists, values, strict=True)),
+                "hyperparams": {**hyperparams, **dict(zip(varied, chosen, strict=True))},
+            }
+
+
+def as_list(value: Any) -> list[Any]:
+    """The value, as a list if it is none."""
+    return value if isinstance(value, list) else [value]
+
+
+def check_lists(varied: Any) -> None:
+    """Refuse a ``vary`` that does not map names to lists.
+
+    :raises ConfigError: if so
+    """
+    if not isinstance(varied, Mapping) or not all(
+        isinstance(values, list) and values for values in varied.values()
+    ):
+        raise ConfigError(
+            f"vary must map hyperparameters to lists, e.g. weight_decay: [0.0, 1.0e-4], got "
+            f"{varied!r}"
+        )

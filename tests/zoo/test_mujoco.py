@@ -1,0 +1,22 @@
+from __future__ import annotations
+
+import gymnasium as gym
+import pytest
+
+from sb3_sparse.zoo.mujoco import mujoco_warns_once
+
+mujoco = pytest.importorskip("mujoco")
+
+
+def test_a_warning_of_mujoco_is_printed_once_and_leaves_no_file(tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sb3_sparse.zoo.mujoco._said", set())
+    before = mujoco.get_mju_user_warning()
+    for _ in range(2):
+        with mujoco_warns_once("HalfCheetah-v5"):
+            gym.make("HalfCheetah-v5").close()
+    out, err = capfd.readouterr()
+    assert "WARNING" not in out + err
+    assert len(err.strip().splitlines()) == err.count("MuJoCo warns:") <= 1
+    assert list(tmp_path.iterdir()) == []
+    assert mujoco.get_mju_user_warning() is before
