@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from importlib import import_module
 from typing import Any
 
 import gymnasium as gym
@@ -26,7 +27,7 @@ def mujoco_warns_once(env_id: str) -> Iterator[None]:
     mujoco: Any = sys.modules.get("mujoco")
     if mujoco is None and "mujoco" in entry_point:
         with suppress(ImportError):  # Gymnasium says what is missing
-            import mujoco
+            mujoco = import_module("mujoco")
     if mujoco is None:
         yield
         return
