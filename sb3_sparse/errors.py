@@ -55,8 +55,11 @@ class Diverged(SparsityError, ArithmeticError):
     """A training whose networks hold values that are not finite."""
 
 
-class CorruptStateError(SparsityError, ValueError):
-    """A saved state contradicts itself or does not belong to this policy."""
+class CorruptStateError(SparsityError, RuntimeError):
+    """A saved state contradicts itself or does not belong to this policy.
+
+    No ``ValueError``: SB3's ``load`` takes that for a file of an old version of its own.
+    """
 
 
 class MissingExtra(SparsityError, ImportError):

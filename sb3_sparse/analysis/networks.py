@@ -18,7 +18,7 @@ from sb3_sparse.errors import UnsupportedError
 from sb3_sparse.policies.aliases import supported_algorithms
 from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.policies.mixin import SparsePolicyMixin
-from sb3_sparse.policies.parts import without_graphs
+from sb3_sparse.policies.parts import WHOLE_POLICY, without_graphs
 from sb3_sparse.policies.spec import NetworkSpec
 
 
@@ -114,7 +114,7 @@ def dense_twin(policy: BasePolicy) -> BasePolicy:
     parameter name, so that gradients at inactive connections can be taken.
     """
     policy = unwrapped(policy)
-    memo = without_graphs(policy)
+    memo: dict[Any, Any] = {**without_graphs(policy), WHOLE_POLICY: True}
     for module in policy.modules():
         for value in vars(module).values():
             if isinstance(value, (th.optim.Optimizer, Controller)):

@@ -38,8 +38,11 @@ class CompactLayer(SparseLayer):
         """What targets and moments go by; differs from the module's after a load."""
         layer.release()
         self.module = CompactLinear.convert(layer.module, structure, is_target=False)
+        self.module.check_mask = self.check_mask
         self._targets = []
-        self._hooks = [self.module.register_load_state_dict_post_hook(self._after_load)]  # type: ignore[no-untyped-call]
+        self._hooks = [
+            self.module.register_load_state_dict_post_hook(self._after_load),  # type: ignore[no-untyped-call]
+        ]
         for target in layer.targets:
             assert isinstance(target, nn.Linear)
             self._targets.append(CompactLinear.convert(target, structure, is_target=True))

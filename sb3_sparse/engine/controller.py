@@ -38,8 +38,7 @@ class Controller:
 
     :param networks: the sparse networks
     :param seed: mask seed, not negative
-    :param functional_gradients: whether the algorithm may take gradients with
-        ``torch.autograd.grad`` (see :mod:`sb3_sparse.engine.gradients`)
+    :param functional_gradients: whether the algorithm may use ``torch.autograd.grad``
     :param weight_decay: coupled L2 coefficient, added to the gradient of every kernel
     :param auto: chooses the storage of layers; None leaves it as it is
     """
@@ -114,6 +113,7 @@ class Controller:
                 optimizer.register_step_pre_hook(self._before_step),
                 optimizer.register_load_state_dict_pre_hook(keep_implementation),
                 optimizer.register_load_state_dict_post_hook(self._after_load),
+                optimizer.register_state_dict_pre_hook(self._settle_moments),
                 optimizer.register_state_dict_post_hook(self._saved_form),
             ]
             if not acts_elementwise(optimizer):
@@ -141,8 +141,8 @@ class Controller:
 
         :param root: the policy
         """
-        layers = list(self.layers)
-        if self._auto and (chosen := self._auto.choose(root, layers, self.optimizers)):
+        auto, layers = self._auto, list(self.layers)
+        if auto and (chosen := auto.choose(root, layers, self.optimizers)):
             self.compact(root, chosen)
 
     def expand(self, root: nn.Module) -> None:
@@ -224,9 +224,8 @@ class Controller:
         )
 
     def _before_step(self, optimizer: th.optim.Optimizer, args: object, kwargs: object) -> None:
-        if self._attach_to_gradients():  # a layer was frozen until now
-            for layer in self.layers:
-                layer.mask_gradient()
+        self._attach_to_gradients()  # a layer may have been frozen until now
+        self._settle_moments(optimizer)
         for network in self.networks:
             if network.optimizer is not optimizer:
                 continue
@@ -235,8 +234,7 @@ class Controller:
                 self._warned = True
                 warn_of_no_plan(self.sparsity)
             for layer in network.layers:
-                if layer.moments_stale:  # a shared extractor may have moments in several
-                    layer.settle_moments(self.optimizers)
+                layer.mask_gradient()  # others may have written it after our hooks
             if self.plan is not None:
                 self._update_if_due(network, self.plan)
             if self.weight_decay:
@@ -263,8 +261,12 @@ class Controller:
         for layer in self.layers:
             layer.moments_stale = True
 
+    def _settle_moments(self, optimizer: th.optim.Optimizer) -> None:
+        for layer in self.layers:
+            if layer.moments_stale:  # a shared extractor may have moments in several
+                layer.settle_moments(self.optimizers)
+
     def _saved_form(self, optimizer: th.optim.Optimizer, state_dict: dict[str, Any]) -> None:
-        """State_dict hook: moments look the same whatever the storage."""
         save_moments(optimizer, state_dict, self.layers)
 
     def _move(

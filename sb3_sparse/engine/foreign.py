@@ -8,6 +8,7 @@ optimizers for this; they look at nothing but the weights of sparse layers.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from itertools import count
 from typing import Any, NamedTuple, Protocol
 from weakref import WeakKeyDictionary, WeakSet, ref
@@ -19,6 +20,8 @@ from torch.optim.optimizer import (
 )
 
 from sb3_sparse.engine.layers import SparseLayer
+from sb3_sparse.engine.optimizers import acts_elementwise
+from sb3_sparse.errors import UnsupportedError
 
 
 class Owner(Protocol):
@@ -37,7 +40,7 @@ class _Found(NamedTuple):
     """The sparse layers that an optimizer moves, and what that was worked out from."""
 
     changes: int
-    parameters: int
+    parameters: int  # hash of their ids
     layers: list[ref[SparseLayer]]
 
 
@@ -66,7 +69,14 @@ def watch(owner: Owner) -> None:
 def _before_step(optimizer: th.optim.Optimizer, args: object, kwargs: object) -> None:
     for layer in _layers_of(optimizer):
         followed = _followed.setdefault(optimizer, WeakKeyDictionary())
-        layer.follow(optimizer, followed.get(layer, layer.connections))
+        since = followed.get(layer, layer.connections)
+        if layer.compact and since is not layer.connections and not acts_elementwise(optimizer):
+            raise UnsupportedError(
+                f"the connections of {layer.name} have moved, and {type(optimizer).__name__} does "
+                "not move each weight by itself, so what it remembers cannot follow them; make a "
+                "new optimizer after the mask has moved, or the policy with compute='masked'"
+            )
+        layer.follow(optimizer, since)
         followed[layer] = layer.connections
 
 
@@ -76,10 +86,10 @@ def _after_step(optimizer: th.optim.Optimizer, args: object, kwargs: object) -> 
 
 
 def _layers_of(optimizer: th.optim.Optimizer) -> Iterator[SparseLayer]:
-    parameters = sum(len(group["params"]) for group in optimizer.param_groups)
+    moved = {id(p) for group in optimizer.param_groups for p in group["params"]}
+    parameters = hash(frozenset(moved))
     found = _found.get(optimizer)
     if found is None or found.changes != _changes or found.parameters != parameters:
-        moved = {id(p) for group in optimizer.param_groups for p in group["params"]}
         layers = [
             ref(layer)
             for owner in _owners
@@ -89,3 +99,28 @@ def _layers_of(optimizer: th.optim.Optimizer) -> Iterator[SparseLayer]:
         ]
         found = _found[optimizer] = _Found(_changes, parameters, layers)
     return (layer for reference in found.layers if (layer := reference()) is not None)
+
+
+class Guard:
+    """Looks after the layers of a network without a policy around it: a copy of an actor, say.
+
+    Gradients are masked where they arrive, and optimizers are followed as :func:`watch` says.
+
+    :param layers: the sparse layers of the copy
+    """
+
+    optimizers: list[th.optim.Optimizer] = []
+    """None that it would look after itself."""
+
+    def __init__(self, layers: Iterable[SparseLayer]) -> None:
+        self.layers = list(layers)
+        for layer in self.layers:
+            if not layer.compact and not layer.frozen:
+                hook: Any = partial(_mask_gradient, ref(layer))
+                layer.weight.register_post_accumulate_grad_hook(hook)  # type: ignore[no-untyped-call]
+        watch(self)
+
+
+def _mask_gradient(reference: ref[SparseLayer], weight: th.Tensor) -> None:
+    if (layer := reference()) is not None:
+        layer.mask_gradient()

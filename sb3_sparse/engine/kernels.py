@@ -51,5 +51,5 @@ def check_plain(module: nn.Module, name: str) -> None:
         raise UnsupportedError(
             f"the weight of {name} is computed from other parameters (spectral_norm, weight_norm "
             "or another parametrization), so it cannot be masked; use a plain "
-            f"{type(module).__name__.removeprefix('Parametrized')}"
+            f"{type(module).__name__.removeprefix('Parametrized').removeprefix('Compact')}"
         )

@@ -13,7 +13,8 @@ from torch import nn
 
 from sb3_sparse.engine.gradients import GradientMask
 from sb3_sparse.engine.kernels import Kernel, check_plain
-from sb3_sparse.errors import TopologyError, UnsupportedError
+from sb3_sparse.engine.linear import MASK_KEY
+from sb3_sparse.errors import CorruptStateError, TopologyError, UnsupportedError
 from sb3_sparse.topology import Exchange
 
 
@@ -105,6 +106,28 @@ class SparseLayer(ABC):
     @abstractmethod
     def _dense_targets(self) -> Iterable[NDArray[np.float32]]:
         """The dense weights of each target."""
+
+    def check_mask(self, mask: th.Tensor) -> None:
+        """Refuse a saved mask of another sparsity.
+
+        :param mask: as many elements as the dense weight, True where active
+        :raises CorruptStateError: if it has fewer connections than the layer ends with, or more
+            than it starts with
+        """
+        count = int(mask.count_nonzero())
+        if not self.final_nnz <= count <= self.initial_nnz:
+            raise CorruptStateError(
+                f"the mask of {self.name} has {count} of {self.size} connections; a policy of this "
+                f"sparsity has {self.final_nnz}"
+                + (f" to {self.initial_nnz}" if self.initial_nnz > self.final_nnz else "")
+                + ". Load a file of the same sparsity, or make the policy with that of the file"
+            )
+
+    def _before_load(
+        self, module: nn.Module, state_dict: dict[str, Any], prefix: str, *_: object
+    ) -> None:
+        if (mask := state_dict.get(prefix + MASK_KEY)) is not None:
+            self.check_mask(mask)
 
     def _after_target_load(self, module: nn.Module, incompatible_keys: object) -> None:
         self.settle_targets(soft=False)

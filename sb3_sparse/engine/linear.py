@@ -10,7 +10,7 @@ from torch import nn
 
 from sb3_sparse.engine.chains import Chain
 from sb3_sparse.engine.structure import Structure
-from sb3_sparse.errors import CorruptStateError, UnsupportedError
+from sb3_sparse.errors import UnsupportedError
 
 MASK_KEY = "weight_mask"
 
@@ -54,6 +54,8 @@ class CompactLinear(nn.Linear):
     """What a hard target computes with if the mask has moved since the last copy."""
     is_target: bool
     listener: Listener | None
+    check_mask: Callable[[th.Tensor], None] | None
+    """Refuses a saved mask that does not go with the layer's sparsity."""
 
     @classmethod
     def convert(cls, module: nn.Linear, structure: Structure, is_target: bool) -> CompactLinear:
@@ -65,6 +67,7 @@ class CompactLinear(nn.Linear):
         module.snapshot = None
         module.is_target = is_target
         module.listener = None
+        module.check_mask = None
         module.weight.grad = None
         module.take_saved(dense)
         return module
@@ -73,7 +76,7 @@ class CompactLinear(nn.Linear):
         """Become ``nn.Linear`` again, in place; the Parameter stays the same object."""
         dense = self.dense()
         self.__class__ = nn.Linear  # type: ignore[assignment]
-        for name in ("structure", "snapshot", "is_target", "listener"):
+        for name in ("structure", "snapshot", "is_target", "listener", "check_mask"):
             del vars(self)[name]
         replace_data(self.weight, dense)
 
@@ -189,7 +192,8 @@ class CompactLinear(nn.Linear):
                 )
                 return
         if mask is not None:
-            check_mask(mask, f"{prefix}weight")
+            if self.check_mask is not None:
+                self.check_mask(mask)
             structure = Structure.of_mask(mask.cpu().numpy(), self.structure.shape)
             if not structure.equals(self.structure):
                 self.take(structure, self.dense())
@@ -198,20 +202,6 @@ class CompactLinear(nn.Linear):
             state_dict[prefix + "weight"] = self.weight.detach().clone()
         super()._load_from_state_dict(
             state_dict, prefix, local_metadata, strict, missing_keys, unexpected_keys, error_msgs
-        )
-
-
-def check_mask(mask: th.Tensor, name: str) -> None:
-    """Refuse a mask without any connection.
-
-    :param mask: of any shape, True or not 0 where active
-    :param name: of the weight that it belongs to
-    :raises CorruptStateError: if nothing is active
-    """
-    if not bool(mask.any()):
-        raise CorruptStateError(
-            f"the mask of {name} has no connection, but every layer has at least one; the file is "
-            "damaged"
         )
 
 

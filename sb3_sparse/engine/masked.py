@@ -18,15 +18,9 @@ from sb3_sparse.engine.gradients import (
 )
 from sb3_sparse.engine.kernels import Kernel
 from sb3_sparse.engine.layers import SparseLayer, moments_of
-from sb3_sparse.engine.linear import MASK_KEY, check_mask
+from sb3_sparse.engine.linear import MASK_KEY
 
 FLOAT_MASK_KEY = "weight_mask_float"
-
-
-def _check_mask_key(module: nn.Module, state_dict: dict[str, Any], prefix: str, *_: object) -> None:
-    """Pre-load hook of a layer."""
-    if (mask := state_dict.get(prefix + MASK_KEY)) is not None:
-        check_mask(mask, f"{prefix}weight")
 
 
 def _ignore_mask_key(
@@ -55,7 +49,7 @@ class MaskedLayer(SparseLayer):
         module.register_buffer(MASK_KEY, ones.bool())
         module.register_buffer(FLOAT_MASK_KEY, ones, persistent=False)
         self._hooks: list[Any] = [
-            module.register_load_state_dict_pre_hook(_check_mask_key),  # type: ignore[no-untyped-call]
+            module.register_load_state_dict_pre_hook(self._before_load),  # type: ignore[no-untyped-call]
             module.register_load_state_dict_post_hook(self._after_load),  # type: ignore[no-untyped-call]
             module.register_state_dict_pre_hook(self._before_save),  # type: ignore[no-untyped-call]
         ]
@@ -99,6 +93,7 @@ class MaskedLayer(SparseLayer):
         self._hooks += [
             module.register_load_state_dict_pre_hook(_ignore_mask_key),  # type: ignore[no-untyped-call]
             module.register_load_state_dict_post_hook(self._after_target_load),  # type: ignore[no-untyped-call]
+            module.register_state_dict_pre_hook(self._before_target_save),  # type: ignore[no-untyped-call]
         ]
         self.sync_targets()
 
@@ -109,9 +104,8 @@ class MaskedLayer(SparseLayer):
                 target.weight.copy_(self.weight)
 
     def mask_targets(self) -> None:
-        with th.no_grad():
-            for target in self.targets:
-                target.weight.mul_(self.float_mask)
+        for target in self.targets:
+            target.weight.data.mul_(self.float_mask)
 
     def set_mask(self, mask: NDArray[np.bool_]) -> None:
         """Replace the mask and set what it has inactive to 0.
@@ -123,7 +117,7 @@ class MaskedLayer(SparseLayer):
         self.apply_mask()
 
     def mask_gradient(self) -> None:
-        if self.weight.grad is not None:
+        if self.weight.grad is not None and not self.full:
             self.weight.grad.mul_(self.float_mask)
 
     def write(self, dense: th.Tensor) -> None:
@@ -144,9 +138,9 @@ class MaskedLayer(SparseLayer):
             self.weight.mul_(self.float_mask)
 
     def remask(self) -> None:
+        # Through .data: a graph that is alive, perhaps in another thread, goes on to be valid.
         if not self.full:
-            with th.no_grad():
-                self.weight.mul_(self.float_mask)
+            self.weight.data.mul_(self.float_mask)
 
     def gradient_mask(self, functional: bool, capturing: Callable[[], bool]) -> GradientMask:
         return (FunctionalGradient if functional else AccumulatedGradient)(self, capturing)
@@ -203,6 +197,9 @@ class MaskedLayer(SparseLayer):
         self.moments_stale = True
         if moved:
             self.mask_targets()
+
+    def _before_target_save(self, module: nn.Module, prefix: str, keep_vars: bool) -> None:
+        self.settle_targets(soft=False)
 
     def _before_save(self, module: nn.Module, prefix: str, keep_vars: bool) -> None:
         self.remask()

@@ -189,10 +189,13 @@ class Products(th.autograd.Function):
         x, work, _, *parameters = ctx.saved_tensors
         needs_x, *needs = ctx.needs_input_grad[1:]
         pairs = list(zip((x, *parameters), (needs_x, *needs), strict=True))
-        if th.is_grad_enabled():  # the gradient shall itself be differentiable; TRPO asks for it
-            result = how.by_dense_weights(x, parameters)
+        # The gradient shall itself be differentiable (TRPO asks for it), or is many at once.
+        again = th.is_grad_enabled()
+        if again or _many(gradients[0]):
+            with th.enable_grad():
+                result = how.by_dense_weights(x, parameters)
             wanted = [tensor for tensor, need in pairs if need]
-            found = iter(th.autograd.grad(result, wanted, gradients, create_graph=True))
+            found = iter(th.autograd.grad(result, wanted, gradients, create_graph=again))
             return None, *(next(found) if need else None for _, need in pairs)
         for structure, values in zip(how.structures, parameters[::2], strict=True):
             if values.numel() != structure.nnz:
@@ -240,6 +243,12 @@ class Products(th.autograd.Function):
         for i, listener, left in listening:
             listener.note(partial(_outer, left, inputs[i], how.batch))
         return None, grad_x, *grads
+
+
+def _many(gradient: th.Tensor) -> bool:
+    """Whether it stands for several gradients at once: ``is_grads_batched``, ``torch.func``."""
+    kinds = th._C._functorch
+    return bool(kinds.is_legacy_batchedtensor(gradient) or kinds.is_batchedtensor(gradient))
 
 
 def _outer(output_grad: th.Tensor, x: th.Tensor, batch: int) -> th.Tensor:

@@ -11,7 +11,7 @@ from stable_baselines3.common.type_aliases import Schedule
 from sb3_sparse.errors import MissingExtra
 from sb3_sparse.policies.critics import PassesGradientsOn, SparseCriticsMixin
 from sb3_sparse.policies.mixin import SparsePolicyMixin, with_extractor
-from sb3_sparse.policies.parts import SparsePart
+from sb3_sparse.policies.parts import ActingPart
 from sb3_sparse.policies.sac import GAUSSIAN_ACTOR, TWIN_CRITIC
 from sb3_sparse.policies.spec import NetworkSpec
 
@@ -26,7 +26,7 @@ except ImportError as error:
     raise MissingExtra("a sparse policy of TQC, QRDQN, CrossQ or TRPO", "contrib") from error
 
 
-class SparseTQCActor(SparsePart, TQCActor):
+class SparseTQCActor(ActingPart, TQCActor):
     """Actor of TQC."""
 
 
@@ -47,7 +47,7 @@ SparseTQCCnnPolicy = with_extractor(SparseTQCPolicy, "Cnn", NatureCNN)
 SparseTQCMultiInputPolicy = with_extractor(SparseTQCPolicy, "MultiInput", CombinedExtractor)
 
 
-class SparseQuantileNetwork(SparsePart, QuantileNetwork):
+class SparseQuantileNetwork(ActingPart, QuantileNetwork):
     """Quantile network of QR-DQN."""
 
 
@@ -96,7 +96,7 @@ def _zero_where(constant: th.Tensor, grad: th.Tensor) -> th.Tensor:
     return grad.masked_fill(constant, 0.0)
 
 
-class SparseCrossQActor(SparsePart, CrossQActor):
+class SparseCrossQActor(ActingPart, CrossQActor):
     """Actor of CrossQ."""
 
 

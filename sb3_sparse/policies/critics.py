@@ -13,7 +13,7 @@ from torch import nn
 
 from sb3_sparse.policies.gaussian import quicken
 from sb3_sparse.policies.mixin import SparsePolicyMixin
-from sb3_sparse.policies.parts import SparsePart
+from sb3_sparse.policies.parts import ActingPart, SparsePart
 
 
 @contextmanager
@@ -55,7 +55,7 @@ class SparseContinuousCritic(PassesGradientsOn, ContinuousCritic):
 class SparseCriticsMixin(SparsePolicyMixin):
     """What the policies of SAC, TD3, DDPG, TQC and CrossQ have in common."""
 
-    actor_class: ClassVar[type[SparsePart]]
+    actor_class: ClassVar[type[ActingPart]]
     critic_class: ClassVar[type[PassesGradientsOn]] = SparseContinuousCritic
     actor_kwargs: dict[str, Any]
     critic_kwargs: dict[str, Any]

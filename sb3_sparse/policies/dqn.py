@@ -6,11 +6,11 @@ from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtr
 from stable_baselines3.dqn.policies import DQNPolicy, QNetwork
 
 from sb3_sparse.policies.mixin import SparsePolicyMixin, with_extractor
-from sb3_sparse.policies.parts import SparsePart
+from sb3_sparse.policies.parts import ActingPart
 from sb3_sparse.policies.spec import NetworkSpec
 
 
-class SparseQNetwork(SparsePart, QNetwork):
+class SparseQNetwork(ActingPart, QNetwork):
     """Q network of DQN."""
 
 

@@ -24,7 +24,7 @@ from sb3_sparse.policies.compiled import names_in, plain_names
 from sb3_sparse.policies.config import SparsityConfig
 from sb3_sparse.policies.extractors import choose_extractor, copied_modules
 from sb3_sparse.policies.named import import_named
-from sb3_sparse.policies.parts import without_graphs
+from sb3_sparse.policies.parts import WHOLE_POLICY, without_graphs
 from sb3_sparse.policies.randomness import peek_seed
 from sb3_sparse.policies.report import SparsityReport, report_on
 from sb3_sparse.policies.spec import NetworkSpec
@@ -134,6 +134,7 @@ class SparsePolicyMixin(BasePolicy):
 
     def __deepcopy__(self: Sparse, memo: dict[int, Any]) -> Sparse:
         memo.update(without_graphs(self))
+        memo[WHOLE_POLICY] = True  # type: ignore[index]
         twin = type(self).__new__(type(self))
         memo[id(self)] = twin
         twin.__dict__.update(copy.deepcopy(self.__dict__, memo))
@@ -221,13 +222,8 @@ class SparsePolicyMixin(BasePolicy):
         """Refuse, before anything is loaded, masks of another sparsity."""
         for layer in self.sparse.layers:
             mask = state_dict.get(f"{layer.name}.weight_mask")
-            if mask is not None and not layer.final_nnz <= int(mask.sum()) <= layer.initial_nnz:
-                raise CorruptStateError(
-                    f"the mask of {layer.name} has {int(mask.sum())} of {layer.size} connections; "
-                    f"a policy of this sparsity has {layer.final_nnz}"
-                    + (f" to {layer.initial_nnz}" if layer.initial_nnz > layer.final_nnz else "")
-                    + ". Load the file with <algorithm>.load, or make the policy with its sparsity"
-                )
+            if mask is not None:
+                layer.check_mask(mask)
 
     def get_extra_state(self) -> th.Tensor:
         """Mask seed, clock and number of mask updates of each network, and a 0; int64.

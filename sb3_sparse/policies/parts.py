@@ -8,15 +8,32 @@ from typing import Any
 import numpy as np
 import torch as th
 from stable_baselines3.common.distributions import Distribution
-from stable_baselines3.common.policies import BaseModel
+from stable_baselines3.common.policies import BaseModel, BasePolicy
 from torch import nn
 
+from sb3_sparse.engine.foreign import Guard
+from sb3_sparse.engine.masked import MaskedLayer
 from sb3_sparse.engine.plain import make_plain
 from sb3_sparse.policies.vectors import from_vector, to_vector
+
+WHOLE_POLICY = "a whole policy is copied"
+"""Key of a memo of ``copy.deepcopy``."""
 
 
 class SparsePart(BaseModel):
     """A network of a sparse policy, as ``model.actor`` or ``model.q_net``."""
+
+    def __deepcopy__(self, memo: dict[Any, Any]) -> Any:
+        memo.update(without_graphs(self))
+        twin = type(self).__new__(type(self))
+        memo[id(self)] = twin
+        twin.__dict__.update(copy.deepcopy(self.__dict__, memo))
+        if WHOLE_POLICY not in memo:  # whose controller looks after its parts
+            vars(twin)["guard"] = Guard(filter(None, map(MaskedLayer.of, twin.modules())))
+        return twin
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name != "guard"}
 
     def save(self, path: Any) -> None:
         """Save the network without the policy, as in SB3, dense: 0 where it is inactive.
@@ -26,7 +43,7 @@ class SparsePart(BaseModel):
 
         :param path: file to write
         """
-        twin = copy.deepcopy(self, without_graphs(self))
+        twin = copy.deepcopy(self)
         make_plain(twin)
         data = twin._get_constructor_parameters()
         th.save({"state_dict": twin.state_dict(), "data": data}, path)
@@ -41,6 +58,17 @@ class SparsePart(BaseModel):
         :raises ConfigError: if the vector has another length
         """
         from_vector(self, vector)
+
+
+class ActingPart(SparsePart, BasePolicy):
+    """A part that predicts by itself: an actor or a Q network."""
+
+    def predict(self, *args: Any, **kwargs: Any) -> Any:
+        """As in SB3, with inactive weights at 0 whoever wrote them."""
+        for module in self.modules():
+            if (layer := MaskedLayer.of(module)) is not None:
+                layer.remask()
+        return super().predict(*args, **kwargs)
 
 
 def without_graphs(root: nn.Module) -> dict[int, Any]:

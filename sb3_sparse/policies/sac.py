@@ -7,7 +7,7 @@ from stable_baselines3.sac.policies import Actor, SACPolicy
 
 from sb3_sparse.policies.critics import SparseCriticsMixin
 from sb3_sparse.policies.mixin import with_extractor
-from sb3_sparse.policies.parts import SparsePart
+from sb3_sparse.policies.parts import ActingPart
 from sb3_sparse.policies.spec import NetworkSpec
 
 GAUSSIAN_ACTOR = NetworkSpec(
@@ -25,7 +25,7 @@ TWIN_CRITIC = NetworkSpec(
 )
 
 
-class SparseSACActor(SparsePart, Actor):
+class SparseSACActor(ActingPart, Actor):
     """Actor of SAC."""
 
 

@@ -7,12 +7,12 @@ from stable_baselines3.td3.policies import Actor, TD3Policy
 
 from sb3_sparse.policies.critics import SparseCriticsMixin
 from sb3_sparse.policies.mixin import with_extractor
-from sb3_sparse.policies.parts import SparsePart
+from sb3_sparse.policies.parts import ActingPart
 from sb3_sparse.policies.sac import TWIN_CRITIC
 from sb3_sparse.policies.spec import NetworkSpec
 
 
-class SparseTD3Actor(SparsePart, Actor):
+class SparseTD3Actor(ActingPart, Actor):
     """Actor of TD3 and DDPG."""
 
 

@@ -11,9 +11,10 @@ import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 from support import ALGORITHMS, DISCRETE, assert_masked, make
 from torch import nn
+from torch.nn.utils import prune  # noqa: F401
 
 from sb3_sparse import SparsityCallback
-from sb3_sparse.errors import ConfigError, UnsupportedError
+from sb3_sparse.errors import ConfigError, CorruptStateError, UnsupportedError
 
 NAMES = sorted(ALGORITHMS)
 PARTS = {"SAC": "actor", "TD3": "actor", "TQC": "actor", "DQN": "q_net", "QRDQN": "quantile_net",
@@ -371,3 +372,185 @@ def test_a_denser_start_without_a_callback_is_no_secret():
     model = make("SAC", policy_kwargs=dict(initial_sparsity=0.0))
     with pytest.warns(UserWarning, match=r"denser than was asked for.*SparsityCallback\('prune'\)"):
         model.learn(40)
+
+
+@pytest.mark.parametrize("name", ["SAC", "DQN", "PPO"])
+def test_predicting_and_saving_leave_a_living_graph_alone(name):
+    model = make(name)
+    x = th.as_tensor(np.stack([model.observation_space.sample() for _ in range(5)]))
+    acting = {"SAC": "actor", "DQN": "q_net"}.get(name)
+    y = model.policy.predict_values(x) if acting is None else getattr(model.policy, acting)(x)
+    model.predict(x.numpy())
+    model.policy.state_dict()
+    y.sum().backward()
+
+
+@pytest.mark.parametrize("name", sorted(PARTS))
+def test_a_part_acts_as_the_policy_whoever_wrote_its_weights(name):
+    model = make(name)
+    observation = model.observation_space.sample()
+    noise_on_parameters(model)
+    alone, _ = getattr(model.policy, PARTS[name]).predict(observation, deterministic=True)
+    whole, _ = model.predict(observation, deterministic=True)
+    np.testing.assert_array_equal(alone, whole)
+
+
+@pytest.mark.parametrize("name", sorted(PARTS))
+def test_a_copy_of_a_part_stays_sparse_while_it_is_trained(name, tmp_path):
+    model = make(name)
+    part = copy.deepcopy(getattr(model.policy, PARTS[name]))
+    optimizer = th.optim.Adam(part.parameters(), lr=0.05)
+    x = th.as_tensor(np.stack([model.observation_space.sample() for _ in range(5)]))
+    for _ in range(3):
+        optimizer.zero_grad()
+        given = part(x)
+        sum(y.square().sum() for y in (given if isinstance(given, tuple) else (given,))).backward()
+        optimizer.step()
+    prefix = f"{PARTS[name]}."
+    for layer in model.policy.sparse.layers:
+        if layer.name.startswith(prefix):
+            module = part.get_submodule(layer.name.removeprefix(prefix))
+            weight = module.state_dict()["weight"].numpy().ravel()
+            assert not weight[~layer.mask()].any()
+    part.save(tmp_path / "part.pth")
+
+
+@pytest.mark.parametrize("name", ["SAC", "TD3", "DQN", "PPO"])
+def test_noise_is_gone_from_what_is_saved_at_once(name):
+    model = make(name)
+    noise_on_parameters(model)
+    state = model.policy.state_dict()
+    for layer in model.policy.sparse.layers:
+        assert not state[f"{layer.name}.weight"].reshape(-1)[~layer.mask()].any()
+        for target in layer.targets:
+            weight = target.state_dict()["weight"]
+            assert int(weight.count_nonzero()) <= layer.nnz
+
+
+def test_noise_is_gone_from_a_part_that_is_saved_at_once(tmp_path):
+    model = make("SAC")
+    noise_on_parameters(model)
+    model.actor.save(tmp_path / "actor.pth")
+    saved = th.load(tmp_path / "actor.pth", weights_only=False)["state_dict"]
+    for layer in model.policy.sparse.networks[0].layers:
+        weight = saved[layer.name.removeprefix("actor.") + ".weight"].reshape(-1)
+        assert not weight[~layer.mask()].any()
+
+
+@pytest.mark.parametrize("name", ["SAC", "DQN"])
+def test_masks_of_another_sparsity_are_refused_by_a_part_and_by_load(name, tmp_path):
+    model, other = make(name), make(name, policy_kwargs=dict(sparsity=0.8))
+    part = PARTS[name]
+    with pytest.raises(CorruptStateError, match="a policy of this sparsity has"):
+        getattr(model.policy, part).load_state_dict(getattr(other.policy, part).state_dict())
+    model.save(tmp_path / "model")
+    kwargs = {**model.policy_kwargs, "sparsity": 0.8}
+    with pytest.raises(CorruptStateError, match="a policy of this sparsity has"):
+        ALGORITHMS[name].load(tmp_path / "model", custom_objects={"policy_kwargs": kwargs})
+
+
+def test_gradients_that_others_wrote_move_nothing_inactive():
+    model = make("PPO")
+    for parameter in model.policy.parameters():
+        parameter.grad = th.ones_like(parameter)
+    model.policy.optimizer.step()
+    for layer in model.policy.sparse.layers:
+        assert not layer.dense()[~layer.mask()].any()
+        for value in model.policy.optimizer.state[layer.weight].values():
+            if value.dim():
+                moment = layer.saved_moment(value).reshape(-1)
+                assert not moment[~layer.mask()].any()
+
+
+def test_parameters_that_join_an_optimizer_of_the_users_own_are_followed():
+    model = make("SAC")
+    layers = list(model.policy.sparse.layers)
+    own = Langevin([layers[0].weight], lr=0.0)
+    layers[0].weight.grad = th.ones_like(layers[0].weight)
+    own.step()
+    own.param_groups[0]["params"] = [layers[1].weight]
+    layers[1].weight.grad = th.ones_like(layers[1].weight)
+    own.step()
+    assert inactive(model) == 0.0
+    own.add_param_group({"params": [layers[4].weight]})
+    layers[4].weight.grad = th.ones_like(layers[4].weight)
+    own.step()
+    assert inactive(model) == 0.0
+
+
+@pytest.mark.parametrize("name", ["SAC", "PPO"])
+def test_lbfgs_is_refused_once_compact_masks_have_moved(name, storage):
+    model = make(name)
+    own = th.optim.LBFGS(model.policy.parameters(), lr=1e-3, max_iter=1)
+    parameters = list(model.policy.parameters())
+
+    def closure():
+        own.zero_grad()
+        loss = sum(parameter.square().sum() for parameter in parameters)
+        loss.backward()
+        return loss
+
+    own.step(closure)
+    sparse = model.policy.sparse
+    sparse.start(SparsityCallback("set", update_interval=1).plan, True, lambda: True)
+    for network in sparse.networks:
+        sparse._move(network, sparse.plan, {})
+    if storage == "sparse":
+        with pytest.raises(UnsupportedError, match="LBFGS does not move each weight by itself"):
+            own.step(closure)
+    else:
+        own.step(closure)
+        assert inactive(model) == 0.0
+
+
+def test_many_gradients_at_once_are_those_one_by_one():
+    model = make("SAC")
+    x = th.randn(2, 3, requires_grad=True)
+    y = model.actor(x, deterministic=True).sum(dim=1)
+    many = th.autograd.grad(y, x, th.eye(2), is_grads_batched=True, retain_graph=True)[0]
+    for i in range(2):
+        (one,) = th.autograd.grad(y[i], x, retain_graph=True)
+        np.testing.assert_allclose(many[i], one, rtol=1e-5, atol=1e-6)
+
+
+def test_a_mask_that_torchs_own_pruning_took_away_is_missed():
+    model = make("PPO", policy_kwargs=dict(compute="masked"))
+    th.nn.utils.prune.l1_unstructured(model.policy.action_net, "weight", 0.3)
+    th.nn.utils.prune.remove(model.policy.action_net, "weight")
+    with pytest.raises(UnsupportedError, match="the mask of action_net was taken away"):
+        model.predict(model.observation_space.sample())
+
+
+def test_two_backward_passes_before_a_step_add_up_for_rigl():
+    grown = []
+    for compute in ("masked", "sparse"):
+        model = make("SAC", policy_kwargs=dict(compute=compute))
+        sparse = model.policy.sparse
+        sparse.start(SparsityCallback("rigl", update_interval=1).plan, True, lambda: True)
+        random = th.Generator().manual_seed(0)
+        for _ in range(2):
+            model.actor(th.randn(6, 3, generator=random), deterministic=True).sum().backward()
+        model.actor.optimizer.step()
+        grown.append([layer.mask() for layer in sparse.networks[0].layers])
+        weights = [layer.dense().copy() for layer in sparse.networks[0].layers]
+        grown.append(weights)
+    for one, other in zip(grown[1], grown[3], strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-5)
+
+
+def test_drawing_anew_keeps_gradients():
+    model = make("SAC")
+    model.actor(th.randn(6, 3), deterministic=True).sum().backward()
+    before = [layer.weight.grad.clone() for layer in model.policy.sparse.networks[0].layers[:2]]
+    drawn_anew(model)
+    for layer, grad in zip(model.policy.sparse.networks[0].layers, before, strict=False):
+        assert th.equal(layer.weight.grad, grad)
+
+
+def test_a_target_keeps_the_connections_of_its_network_whatever_masks_it_is_given():
+    model, other = make("DQN", seed=0), make("DQN", seed=1)
+    model.q_net_target.load_state_dict(other.q_net.state_dict())
+    model.learn(60)  # the next copy needs the online connections
+    assert_masked(model)
+    for ours, target in zip(model.q_net.parameters(), model.q_net_target.parameters(), strict=True):
+        assert ours.shape == target.shape
