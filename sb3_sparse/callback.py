@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import warnings
-
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_sparse.engine.plan import Plan
-from sb3_sparse.errors import ConfigError, SparsityWarning
+from sb3_sparse.errors import ConfigError, warn
 from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.policies.mixin import SparsePolicyMixin
 from sb3_sparse.topology import method_named
@@ -136,14 +134,12 @@ class SparsityCallback(BaseCallback):
         sparse = self._sparse_policy().sparse
         never_moved = not any(network.mask_updates for network in sparse.networks)
         if self.plan.topology.options and sparse.updates_due == 0 and never_moved:
-            warnings.warn(
+            warn(
                 f"{self.plan.method!r} had no mask update, so this was static training: the "
                 f"networks have made {', '.join(str(n.clock) for n in sparse.networks)} gradient "
                 f"steps, and update_interval is {self.plan.update_interval}, with updates from "
                 f"{self.plan.begin:.0%} to {self.plan.end:.0%} of training; train longer or choose "
-                "a smaller one",
-                SparsityWarning,
-                stacklevel=2,
+                "a smaller one"
             )
 
     def _note_progress(self) -> None:

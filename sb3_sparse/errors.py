@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterable
+import sys
+import warnings
+from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
+
+BETWEEN = {"sb3_sparse", "stable_baselines3", "sb3_contrib", "rl_zoo3", "optuna", "torch"}
+"""Packages whose code may run between a line of the user's and the place that warns."""
 
 
 def did_you_mean(name: object, known: Iterable[str]) -> str:
@@ -29,6 +34,23 @@ class SparsityError(Exception):
 
 class SparsityWarning(UserWarning):
     """Training goes on, but perhaps not as you meant it; the message says what to change."""
+
+
+def warn(message: str) -> None:
+    """Give a :class:`SparsityWarning` at the line of the user's code that led to it.
+
+    Python prints that line below the message; one of this package or of SB3 would explain nothing.
+
+    :param message: what happened, and what to change
+    """
+    frame, level = sys._getframe(1), 2
+    while frame.f_back is not None and _package_of(frame.f_globals) in BETWEEN:
+        frame, level = frame.f_back, level + 1
+    warnings.warn(message, SparsityWarning, stacklevel=level)
+
+
+def _package_of(namespace: Mapping[str, object]) -> str:
+    return str(namespace.get("__name__", "")).partition(".")[0]
 
 
 class ConfigError(SparsityError, ValueError):

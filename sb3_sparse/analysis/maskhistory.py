@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_sparse.engine.network import SparseNetwork
-from sb3_sparse.errors import CorruptStateError, SparsityWarning
+from sb3_sparse.errors import CorruptStateError, warn
 from sb3_sparse.loading.arrays import read_arrays
 from sb3_sparse.loading.guard import reading
 
@@ -40,11 +39,7 @@ class MaskHistory:
             self._load(path, timesteps)
             return
         if path is not None and timesteps:
-            warnings.warn(
-                f"{path} is not there, so exploration rates count from step {timesteps} on",
-                SparsityWarning,
-                stacklevel=2,
-            )
+            warn(f"{path} is not there, so exploration rates count from step {timesteps} on")
         for layer in self._layers():
             self.first[layer.name] = np.full(layer.size, NEVER, np.uint32)
         self._see(timesteps)

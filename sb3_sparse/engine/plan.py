@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 
-from sb3_sparse.errors import ConfigError, SparsityWarning
+from sb3_sparse.errors import ConfigError, warn
 from sb3_sparse.sparsity.numeric import is_number, is_whole
 from sb3_sparse.sparsity.schedules import cosine_drop_fraction
 from sb3_sparse.topology import Moment, TopologyMethod, method_named
@@ -78,10 +77,8 @@ def warn_of_no_plan(sparsity: float) -> None:
 
     :param sparsity: what it has now
     """
-    warnings.warn(
+    warn(
         f"the policy trains at sparsity {sparsity:.3g}, denser than was asked for, and nothing "
         "takes it further: pass SparsityCallback('prune') to learn(), or leave initial_sparsity "
-        "out to begin at the sparsity asked for",
-        SparsityWarning,
-        stacklevel=2,
+        "out to begin at the sparsity asked for"
     )

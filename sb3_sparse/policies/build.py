@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable, Iterable, Mapping
 
 from stable_baselines3.common.policies import BasePolicy
@@ -13,7 +12,7 @@ from torch import nn
 from sb3_sparse.engine.kernels import KERNEL_TYPES, find_kernels
 from sb3_sparse.engine.masked import MaskedLayer
 from sb3_sparse.engine.network import SparseNetwork
-from sb3_sparse.errors import ConfigError, SparsityWarning, UnsupportedError
+from sb3_sparse.errors import ConfigError, UnsupportedError, warn
 from sb3_sparse.policies.config import SparsityConfig
 from sb3_sparse.policies.spec import (
     DENSE_WORDS,
@@ -100,12 +99,10 @@ def _warn_of_redrawn(
         if layer.name.startswith(tuple(own)) and not _as_torch_draws(layer.weight)
     ]
     if lost:
-        warnings.warn(
+        warn(
             f"the weights of {', '.join(lost)} are drawn anew, by the connections that are there, "
             "though they are not as torch draws them. To keep weights of your own, pretrained ones "
-            "for instance, masked, give policy_kwargs=dict(sparsity_aware_init=False)",
-            SparsityWarning,
-            stacklevel=2,
+            "for instance, masked, give policy_kwargs=dict(sparsity_aware_init=False)"
         )
 
 

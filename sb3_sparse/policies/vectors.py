@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,7 @@ from torch import nn
 
 from sb3_sparse.engine.linear import CompactLinear
 from sb3_sparse.engine.masked import MaskedLayer
-from sb3_sparse.errors import ConfigError, SparsityWarning
+from sb3_sparse.errors import ConfigError, warn
 
 
 def to_vector(root: nn.Module) -> NDArray[np.float32]:
@@ -66,11 +65,9 @@ def from_vector(root: nn.Module, vector: NDArray[Any]) -> None:
             kept = parameter.detach()
         dropped += int(part.count_nonzero() - kept.count_nonzero())
     if dropped:
-        warnings.warn(
+        warn(
             f"{dropped} of the vector's values belong to inactive connections and were dropped; "
-            "what is inactive stays 0",
-            SparsityWarning,
-            stacklevel=3,
+            "what is inactive stays 0"
         )
 
 

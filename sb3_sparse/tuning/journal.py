@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import tempfile
-import warnings
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -16,7 +15,7 @@ from optuna.storages._heartbeat import BaseHeartbeat
 from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
 from optuna.storages.journal._file import get_lock_file
 
-from sb3_sparse.errors import SparsityWarning
+from sb3_sparse.errors import warn
 from sb3_sparse.tuning.backend import BaseStorage, FrozenTrial, TrialState
 from sb3_sparse.tuning.queue import FromQueue, StaleCallback
 
@@ -71,12 +70,10 @@ class JournalFile(JournalFileBackend):
                 os.fsync(kept.fileno())
             file.truncate(position)
             os.fsync(file.fileno())
-        warnings.warn(
+        warn(
             f"the last line of the journal {self.path} was not written to its end, as after a "
             f"power cut or on a full disk; its {len(tail)} bytes are in {aside} now, and the study "
-            "goes on without them",
-            SparsityWarning,
-            stacklevel=4,
+            "goes on without them"
         )
 
 

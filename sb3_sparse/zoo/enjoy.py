@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import importlib.util
+import io
 import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext, redirect_stderr
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -123,9 +124,13 @@ def enjoy(
 
 @contextmanager
 def _filmed(saved: Saved, video: bool) -> Iterator[None]:
-    """Within it, what goes wrong while a video is made is said of the video."""
+    """Within it, what goes wrong while a video is made is said of the video.
+
+    MoviePy's own bar, which it draws on stderr wherever that goes, is left out.
+    """
     try:
-        yield
+        with redirect_stderr(io.StringIO()) if video else nullcontext():
+            yield
     except OSError:
         raise  # a folder that cannot be written to names itself
     except Exception as error:

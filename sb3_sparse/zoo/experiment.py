@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import warnings
 from argparse import Namespace
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping
@@ -18,7 +17,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_sparse.errors import MissingExtra, SparsityWarning
+from sb3_sparse.errors import MissingExtra, warn
 from sb3_sparse.policies.saving import load_without_buffer
 from sb3_sparse.zoo.checkpoint import REPLAY_BUFFER
 from sb3_sparse.zoo.mujoco import mujoco_warns_once
@@ -115,11 +114,9 @@ class Experiment(ExperimentManager):
     def _restore_buffer(self, model: OffPolicyAlgorithm) -> None:
         folder = Path(self.trained_agent).parent / REPLAY_BUFFER
         if not folder.is_dir():
-            warnings.warn(
+            warn(
                 f"there is no replay buffer in {folder}: the run goes on with an empty one, which "
-                "trains otherwise than an uninterrupted run",
-                SparsityWarning,
-                stacklevel=2,
+                "trains otherwise than an uninterrupted run"
             )
             write_record(Path(self.save_path), without_buffer_from=model.num_timesteps)
             return

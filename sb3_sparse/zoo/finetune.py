@@ -20,6 +20,7 @@ from sb3_sparse.sparsity.numeric import is_whole
 from sb3_sparse.zoo.environments import import_packages, is_atari, known_environment
 from sb3_sparse.zoo.experiment import quiet
 from sb3_sparse.zoo.folder import CONFIG, RESTORE, arguments_of, params_of
+from sb3_sparse.zoo.mujoco import mujoco_warns_once
 from sb3_sparse.zoo.prepare import explained
 from sb3_sparse.zoo.saved import Saved
 
@@ -91,7 +92,8 @@ def envs_of(
         own = settings.get("env_wrapper") or []
         settings["env_wrapper"] = [*(own if isinstance(own, list) else [own]), *wrappers]
     where = "" if saved.params is None else f" with the wrappers and arguments in {saved.params}"
-    with explained(f"{env_id} cannot be made{where}", env_id), quiet():
+    failure = f"{env_id} cannot be made{where}"
+    with explained(failure, env_id), quiet(), mujoco_warns_once(env_id):
         check_wrappers(settings)
         envs: VecEnv = create_test_env(
             env_id,
