@@ -12,7 +12,9 @@ from importlib import import_module
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from sb3_sparse.lazy import lazily
 
 if TYPE_CHECKING:
     from sb3_sparse.callback import SparsityCallback
@@ -37,34 +39,26 @@ __all__ = [
 _CONTRIB = ["SparseCrossQPolicy", "SparseQRDQNPolicy", "SparseTQCPolicy"]
 if find_spec("sb3_contrib"):
     __all__ += _CONTRIB
-_HOMES = {
-    "SparseActorCriticPolicy": "policies.actor_critic",
-    "SparseDQNPolicy": "policies.dqn",
-    "SparsePolicy": "policies.aliases",
-    "SparseSACPolicy": "policies.sac",
-    "SparseTD3Policy": "policies.td3",
-    "SparsityCallback": "callback",
-    "sparsify": "compress.twin",
-    "supported_algorithms": "policies.aliases",
-    **dict.fromkeys(_CONTRIB, "policies.contrib"),
-}
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
-    globals()[name] = value
-    return value
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+__getattr__, __dir__ = lazily(
+    __name__,
+    {
+        "SparseActorCriticPolicy": "policies.actor_critic",
+        "SparseDQNPolicy": "policies.dqn",
+        "SparsePolicy": "policies.aliases",
+        "SparseSACPolicy": "policies.sac",
+        "SparseTD3Policy": "policies.td3",
+        "SparsityCallback": "callback",
+        "sparsify": "compress.twin",
+        "supported_algorithms": "policies.aliases",
+        **dict.fromkeys(_CONTRIB, "policies.contrib"),
+    },
+)
 
 
 def _is_command_line() -> bool:
     """Whether this process is ``sb3-sparse``, or ``python -m sb3_sparse.cli``."""
-    return Path(sys.argv[0]).stem == "sb3-sparse" or "sb3_sparse.cli" in sys.orig_argv
+    program = Path(*sys.argv[:1])  # an embedded interpreter may have none
+    return program.stem == "sb3-sparse" or "sb3_sparse.cli" in sys.orig_argv
 
 
 if not _is_command_line():

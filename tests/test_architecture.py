@@ -21,7 +21,7 @@ FLOORS = [
     {"engine"},
     {"topology"},
     {"sparsity"},
-    {"errors"},
+    {"errors", "lazy"},
 ]
 HEIGHT = {part: -level for level, parts in enumerate(FLOORS) for part in parts}
 # What a floor may not know at all.

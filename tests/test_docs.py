@@ -17,8 +17,8 @@ from sb3_sparse import SparsePolicy, cli
 from sb3_sparse.export import export
 from sb3_sparse.topology import registry
 from sb3_sparse.tuning import space_of
+from sb3_sparse.tuning.search import define
 from sb3_sparse.tuning.spaces import check_space
-from sb3_sparse.tuning.tune import define
 from sb3_sparse.zoo.run import Run
 from sb3_sparse.zoo.train import train
 

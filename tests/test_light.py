@@ -5,6 +5,9 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from importlib import import_module
+from pathlib import Path
+from pkgutil import iter_modules
 
 import pytest
 
@@ -14,9 +17,9 @@ from sb3_sparse.experiments.spec import Study
 HEAVY = ["torch", "stable_baselines3", "sb3_contrib", "rl_zoo3", "optuna", "matplotlib", "pandas"]
 
 
-def run(code: str, *args: str) -> subprocess.CompletedProcess[str]:
+def run(code: str, *args: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-c", code, *args]
-    return subprocess.run(command, capture_output=True, text=True, check=False)
+    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=False)
 
 
 COMMAND = f"""
@@ -43,7 +46,13 @@ finally:
         (["train", "--env", "CartPool-v1"], "did you mean 'CartPole-v1'?"),
         (["train", "--method", "riggle"], "no config is shipped for method 'riggle'"),
         (["tune", "--algo", "sacc"], "did you mean 'sac'?"),
+        (["tune", "--space", "papers"], "did you mean 'paper'?"),
+        (["tune", "--sampler", "gird"], "did you mean 'grid'?"),
+        (["tune", "--launcher", "slurm"], "unknown launcher 'slurm'; allowed are local, ray"),
+        (["export", "model.zip", "--to", "onxn"], "did you mean 'onnx'?"),
         (["study", "run", "classic_contol"], "did you mean 'classic_control'?"),
+        (["study", "status", "classic_contol"], "did you mean 'classic_control'?"),
+        (["study", "report", "snr", "--scale", "smal"], "did you mean 'small'?"),
     ],
 )
 def test_help_lists_and_mistyped_names_need_no_torch(args, said):
@@ -65,51 +74,99 @@ def test_a_package_that_is_imported_before_sb3_registers_its_policies_all_the_sa
 
 
 EVERYTHING = """
-import json, logging, os, pkgutil, sys, warnings
+import json, logging, os, pkgutil, signal, sys, types, warnings
 from importlib import import_module
-import gymnasium, matplotlib, numpy, optuna, pandas, rl_zoo3.exp_manager, rl_zoo3.train, sb3_contrib
-import stable_baselines3, torch, ale_py, onnx, plotly.io, ray, ruamel.yaml, tensorboard, yaml
-import rliable.library, scipy.stats, moviepy, onnxruntime, psycopg, typer, rich
-from rl_zoo3.exp_manager import ExperimentManager
+import gymnasium, matplotlib, numpy, optuna, pandas, rl_zoo3.enjoy, rl_zoo3.train, sb3_contrib
+import stable_baselines3, torch, ale_py, mujoco, onnx, plotly.io, ray, ruamel.yaml, tensorboard
+import rliable.library, scipy.stats, moviepy, yaml, onnxruntime, psycopg, sqlalchemy, typer, rich
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_SAMPLER
 from torch.optim import optimizer
+
+warnings.simplefilter("ignore")  # some of what is looked at is deprecated
+LIBRARIES = {
+    "gymnasium", "logging", "matplotlib", "mujoco", "numpy", "optuna", "os", "pandas", "rich",
+    "rl_zoo3", "sb3_contrib", "scipy", "signal", "stable_baselines3", "sys", "torch", "typer",
+    "warnings", "yaml",
+}
+
+def attributes():
+    "Functions, classes, methods and containers of other libraries' modules and classes."
+    found = {}
+    for name, module in list(sys.modules.items()):
+        if name.split(".")[0] not in LIBRARIES or not isinstance(module, types.ModuleType):
+            continue
+        for key, value in list(vars(module).items()):
+            found[name, key] = value
+            if isinstance(value, type) and value.__module__.split(".")[0] in LIBRARIES:
+                found.update({(name, key, own): one for own, one in vars(value).items()})
+    kinds = (type, types.FunctionType, property, classmethod, staticmethod, dict, list, set)
+    return {key: value for key, value in found.items() if isinstance(value, kinds)}
 
 def state():
     return {
         "warnings": [repr(one) for one in warnings.filters],
-        "showwarning": repr(warnings.showwarning),
-        "formatwarning": repr(warnings.formatwarning),
         "optuna": optuna.logging.get_verbosity(),
         "matplotlib": [matplotlib.get_backend(), repr(dict(matplotlib.rcParams))],
-        "threads": torch.get_num_threads(),
-        "dtype": str(torch.get_default_dtype()),
+        "torch": [torch.get_num_threads(), torch.is_grad_enabled(), str(torch.get_default_dtype()),
+                  torch.backends.mkldnn.enabled, torch.backends.cudnn.benchmark],
+        "denormals": (torch.tensor([1e-40]) * 1.0).item(),
         "random": [torch.get_rng_state().sum().item(), repr(numpy.random.get_state()[1][:9])],
         "hooks": [len(optimizer._global_optimizer_pre_hooks),
                   len(optimizer._global_optimizer_post_hooks)],
+        "numpy": [repr(numpy.geterr()), repr(numpy.get_printoptions())],
         "environment": dict(os.environ),
         "logging": [logging.root.level, repr(logging.root.handlers)],
-        "rl_zoo3": [repr(ExperimentManager.objective), repr(sorted(HYPERPARAMS_SAMPLER.items()))],
-        "excepthook": repr(sys.excepthook),
+        "signals": [repr(signal.getsignal(number)) for number in range(1, 30)],
+        "imports": [repr(sys.meta_path), repr(sys.path_hooks), list(sys.path)],
+        "rl_zoo3": repr(sorted(HYPERPARAMS_SAMPLER.items())),
+        "gymnasium": sorted(gymnasium.registry),
+        "mujoco": repr(mujoco.get_mju_user_warning()),
         "yaml": sorted(map(str, yaml.SafeLoader.yaml_constructors)),
         "cwd": sorted(os.listdir()),
-        "pandas": pandas.get_option("display.max_rows"),
     }
 
-before = state()
+state()  # which looks at what libraries load as they are asked
+before, objects = state(), attributes()
 import sb3_sparse
 for module in pkgutil.walk_packages(sb3_sparse.__path__, "sb3_sparse."):
     patches = module.name == "sb3_sparse.rl_zoo_optimize"  # as its name says
-    if not patches and not module.name.endswith((".__main__", ".kernels")):
+    if not patches and not module.name.endswith(".__main__") and ".native." not in module.name:
         import_module(module.name)
-after = state()
-print(json.dumps([key for key in before if before[key] != after[key]]))
+after, now = state(), attributes()
+print(json.dumps([
+    [key for key in before if before[key] != after[key]],
+    [".".join(key) for key, value in objects.items() if now.get(key) is not value],
+    len(objects),
+]))
 """
 
 
-def test_importing_everything_changes_nothing_of_other_libraries():
-    done = run(EVERYTHING)
+def test_importing_everything_changes_nothing_of_other_libraries(tmp_path):
+    done = run(EVERYTHING, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert json.loads(done.stdout.splitlines()[-1]) == []
+    changed, replaced, count = json.loads(done.stdout.splitlines()[-1])
+    assert (changed, replaced) == ([], [])
+    assert count > 10_000
+
+
+def test_the_test_of_imports_sees_what_the_patching_module_does(tmp_path):
+    done = run(EVERYTHING.replace("patches = ", "patches = False and "), cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    changed, replaced, _ = json.loads(done.stdout.splitlines()[-1])
+    assert changed == ["rl_zoo3"]
+    assert {name.rpartition("Experiment")[2] for name in replaced} == {"Manager.objective"}
+
+
+@pytest.mark.parametrize("package", ["", ".experiments", ".export", ".tuning"])
+def test_names_that_are_imported_as_needed_are_no_modules(package):
+    module = import_module(f"sb3_sparse{package}")
+    modules = {one.name for one in iter_modules(module.__path__)}
+    for name in module.__all__:
+        assert name not in modules
+        assert name in dir(module)
+        getattr(module, name)
+    with pytest.raises(AttributeError, match="has no attribute 'nothing'"):
+        module.nothing  # noqa: B018
 
 
 @pytest.mark.parametrize("name", study_names())

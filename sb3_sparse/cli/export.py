@@ -9,6 +9,7 @@ import typer
 
 from sb3_sparse.cli.common import Best, GymPackages, ModelAlgo, ModelEnv, Statistics, console, text
 from sb3_sparse.errors import ConfigError
+from sb3_sparse.export.formats import check_format
 
 RECORDED = 1000
 RECORDING_ENVS = 10
@@ -34,13 +35,12 @@ def export(
 
     Observations to check with are recorded in the environment, if it is known.
     """
-    from sb3_sparse.export import FORMATS, record_observations
+    check_format(to)
     from sb3_sparse.export import export as write
+    from sb3_sparse.export import record_observations
     from sb3_sparse.zoo.finetune import evaluation_envs
     from sb3_sparse.zoo.saved import find_saved
 
-    if to not in FORMATS:
-        raise ConfigError(f"--to must be one of {', '.join(FORMATS)}, got {to!r}")
     saved = find_saved(
         model,
         best=best,

@@ -14,9 +14,10 @@ from rich.table import Table
 from sb3_sparse.cli.common import INTERRUPTED, Address, GymPackages, Launcher, console, text
 from sb3_sparse.cli.studyprogress import StudyProgress
 from sb3_sparse.errors import ConfigError, MissingExtra
+from sb3_sparse.experiments import Study
+from sb3_sparse.launch import launcher_named
 
 if TYPE_CHECKING:
-    from sb3_sparse.experiments import Study
     from sb3_sparse.experiments.standing import CellStanding
 
 OVER = ("done", "diverged")
@@ -52,17 +53,15 @@ def run(
     gym_packages: GymPackages = None,
 ) -> None:
     """Train what a study lacks. What is done stays done; the same command goes on."""
-    from sb3_sparse.experiments import Study
-
     packages = gym_packages or []
+    chosen = launcher_named(launcher, address)
     study = Study.read(name, scale, packages)
     from sb3_sparse.experiments import run_study  # not for a mistyped name
-    from sb3_sparse.launch import launcher_named
 
     if Path(name).suffix:
         _check_figures(study)
     _say_merged(study)
-    runner = run_study(study, store, launcher_named(launcher, address), workers)
+    runner = run_study(study, store, chosen, workers)
     shown = StudyProgress(console)
     last = None
     try:
@@ -104,12 +103,11 @@ def status(
     gym_packages: GymPackages = None,
 ) -> None:
     """How far a study is, and which of its runs failed."""
-    from sb3_sparse.experiments import Study
+    packages = gym_packages or []
+    study = Study.read(name, scale, packages)
     from sb3_sparse.experiments.standing import FAILED, RUNNING, STOPPED, counts
     from sb3_sparse.zoo.record import DIVERGED
 
-    packages = gym_packages or []
-    study = Study.read(name, scale, packages)
     standings = _standings(study, store)
     _say_merged(study)
     found = counts(standings)
@@ -139,11 +137,10 @@ def report(
     gym_packages: GymPackages = None,
 ) -> None:
     """Figures, tables and verdicts of what is done, as one page that opens from disk."""
-    from sb3_sparse.experiments import Study
-    from sb3_sparse.report import write_report
-
     packages = gym_packages or []
     study = Study.read(name, scale, packages)
+    from sb3_sparse.report import write_report
+
     standings = _standings(study, store)
     folders = [one.folder for one in standings if one.folder.is_dir()]
     if not folders:

@@ -32,6 +32,8 @@ from sb3_sparse.cli.common import (
     values_and_packages,
 )
 from sb3_sparse.cli.tuneprogress import TuningProgress, values_in_words
+from sb3_sparse.launch import launcher_named
+from sb3_sparse.tuning.choices import check_names
 from sb3_sparse.zoo.run import Run
 from sb3_sparse.zoo.settings import parse_overrides
 
@@ -110,6 +112,8 @@ def search(
     The same command goes on with an interrupted study, and on another machine joins it.
     """
     values, packages = values_and_packages(context.args, hyperparams, gym_packages)
+    check_names(space, sampler, pruner)
+    chosen = launcher_named(launcher, address)
     run = Run(
         algo=algo.lower(),
         env_id=env,
@@ -127,7 +131,6 @@ def search(
         gym_packages=tuple(packages),
     )
     run.config_entry()  # a mistyped name shall not wait for torch
-    from sb3_sparse.launch import launcher_named
     from sb3_sparse.tuning import tune
     from sb3_sparse.tuning.best import check_target
     from sb3_sparse.tuning.best import write_into as merge
@@ -147,7 +150,7 @@ def search(
             storage=storage,
             log_folder=log_folder,
             workers=workers,
-            launcher=launcher_named(launcher, address),
+            launcher=chosen,
             watch=progress,
         )
     except KeyboardInterrupt:

@@ -1,7 +1,26 @@
 """Policies that run elsewhere: C, NumPy, ONNX, and zips of stock SB3."""
 
-from sb3_sparse.export.observations import record_observations
-from sb3_sparse.export.parity import Parity, ParityError
-from sb3_sparse.export.write import FORMATS, ExportReport, export
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from sb3_sparse.lazy import lazily
+
+if TYPE_CHECKING:
+    from sb3_sparse.export.formats import FORMATS
+    from sb3_sparse.export.observations import record_observations
+    from sb3_sparse.export.parity import Parity, ParityError
+    from sb3_sparse.export.write import ExportReport, export
 
 __all__ = ["FORMATS", "ExportReport", "Parity", "ParityError", "export", "record_observations"]
+__getattr__, __dir__ = lazily(
+    __name__,
+    {
+        "FORMATS": "formats",
+        "ExportReport": "write",
+        "Parity": "parity",
+        "ParityError": "parity",
+        "export": "write",
+        "record_observations": "observations",
+    },
+)

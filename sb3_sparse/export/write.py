@@ -24,6 +24,7 @@ from sb3_sparse.export.artifact import (
 )
 from sb3_sparse.export.extract import check_model, graph_of, span_of
 from sb3_sparse.export.fold import fold
+from sb3_sparse.export.formats import check_format
 from sb3_sparse.export.graph import Graph
 from sb3_sparse.export.nodes import Argmax
 from sb3_sparse.export.observations import (
@@ -40,7 +41,6 @@ from sb3_sparse.loading.statistics import read_statistics
 from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.policies.saving import was_normalised
 
-FORMATS = ("c", "numpy", "onnx", "dense")
 RANDOM = 1000
 RANDOM_IMAGES = 100
 
@@ -124,8 +124,7 @@ def export(
         than 1e-5, relative to those above 1 and to the range that they are squashed into, or a
         discrete action that differs
     """
-    if to not in FORMATS:
-        raise ConfigError(f"to must be one of {', '.join(map(repr, FORMATS))}, got {to!r}")
+    check_format(to)
     if int8 and to != "c":
         raise ConfigError(f"int8 is for to='c' only, got to={to!r}")
     check_model(model)

@@ -1,11 +1,18 @@
 """Tuning with Optuna: the paper's grids and beyond, from one process to many machines."""
 
-from sb3_sparse.tuning.objective import Objective
-from sb3_sparse.tuning.report import write_report
-from sb3_sparse.tuning.shipped import paper_space, wide_space
-from sb3_sparse.tuning.spacefile import space_of
-from sb3_sparse.tuning.spaces import Space
-from sb3_sparse.tuning.tune import Tuned, tune
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from sb3_sparse.lazy import lazily
+
+if TYPE_CHECKING:
+    from sb3_sparse.tuning.objective import Objective
+    from sb3_sparse.tuning.report import write_report
+    from sb3_sparse.tuning.search import Tuned, tune
+    from sb3_sparse.tuning.shipped import paper_space, wide_space
+    from sb3_sparse.tuning.spacefile import space_of
+    from sb3_sparse.tuning.spaces import Space
 
 __all__ = [
     "Objective",
@@ -17,3 +24,16 @@ __all__ = [
     "wide_space",
     "write_report",
 ]
+__getattr__, __dir__ = lazily(
+    __name__,
+    {
+        "Objective": "objective",
+        "Space": "spaces",
+        "Tuned": "search",
+        "paper_space": "shipped",
+        "space_of": "spacefile",
+        "tune": "search",
+        "wide_space": "shipped",
+        "write_report": "report",
+    },
+)

@@ -9,23 +9,13 @@ import numpy as np
 
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.tuning.backend import BaseDistribution, FrozenTrial, TrialState, optuna
+from sb3_sparse.tuning.choices import PRUNERS, SAMPLERS, check_choice
 from sb3_sparse.tuning.spaces import Space
 
 BaseSampler = optuna.samplers.BaseSampler
-SAMPLERS = ("grid", "tpe", "random")
-PRUNERS = ("none", "median", "halving", "hyperband")
 TICKET = "sb3_sparse:ticket"  # which of the study's planned trials a trial is an attempt at
 STARTUP_TRIALS = 5
 REDUCTION = 3
-
-
-def check_choice(what: str, name: str, allowed: Sequence[str]) -> None:
-    """Refuse a name that is not allowed.
-
-    :raises ConfigError: if so
-    """
-    if name not in allowed:
-        raise ConfigError(f"unknown {what} {name!r}; allowed are {', '.join(allowed)}")
 
 
 def sampler_of(name: str, space: Space, seed: int) -> BaseSampler:

@@ -10,6 +10,7 @@ from sb3_sparse.errors import ConfigError
 from sb3_sparse.loading.text import read_text
 from sb3_sparse.sparsity.numeric import is_number, is_whole
 from sb3_sparse.tuning.backend import BaseDistribution, quiet_optuna
+from sb3_sparse.tuning.choices import check_space
 from sb3_sparse.tuning.shipped import paper_space, wide_space
 from sb3_sparse.tuning.spaces import (
     CategoricalDistribution,
@@ -24,8 +25,6 @@ from sb3_sparse.zoo.prepare import prepare
 from sb3_sparse.zoo.run import Run
 from sb3_sparse.zoo.settings import method_of
 
-SHIPPED = ("paper", "wide")
-
 
 @quiet_optuna()
 def space_of(what: str, run: Run) -> Space:
@@ -39,6 +38,7 @@ def space_of(what: str, run: Run) -> Space:
     :param run: what is to be tuned
     :raises ConfigError: if there is no such space, or something is wrong with it
     """
+    check_space(what)
     method = method_of(run.settings())
     if what == "paper":
         return paper_space(method)
@@ -48,13 +48,6 @@ def space_of(what: str, run: Run) -> Space:
     if path.suffix in (".yml", ".yaml"):
         content = read_yaml(path, "hyperparameters to choices")
         return Space(path.stem, _distributions(content, path.name))
-    if path.suffix != ".py":
-        raise ConfigError(
-            f"unknown search space {what!r}; allowed are {', '.join(SHIPPED)}, or a file of your "
-            "own, .yml or .py (docs/tuning.md)"
-        )
-    if not path.is_file():
-        raise ConfigError(f"there is no search space {path}")
     code = read_text(path, "search space", "give a file of your own (docs/tuning.md)")
     found = run_code(code, path.name)
     if isinstance(found, Mapping):

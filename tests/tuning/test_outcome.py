@@ -21,9 +21,9 @@ from sb3_sparse.tuning import tune, write_report
 from sb3_sparse.tuning.backend import TrialState, optuna
 from sb3_sparse.tuning.best import best_settings, check_target, write_best, write_into
 from sb3_sparse.tuning.report import report_on
+from sb3_sparse.tuning.search import define
 from sb3_sparse.tuning.storage import open_storage
 from sb3_sparse.tuning.study import DEFINITION, TICKET, enter_study, standing_of
-from sb3_sparse.tuning.tune import define
 from sb3_sparse.zoo.configs import config_path
 from sb3_sparse.zoo.run import Run
 from sb3_sparse.zoo.train import train

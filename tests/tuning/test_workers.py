@@ -21,9 +21,9 @@ from sb3_sparse.tuning import Space, tune
 from sb3_sparse.tuning.backend import TrialState, optuna
 from sb3_sparse.tuning.queue import QueueEmpty
 from sb3_sparse.tuning.samplers import TICKET, sampler_of
+from sb3_sparse.tuning.search import define
 from sb3_sparse.tuning.storage import open_storage, retry_with
 from sb3_sparse.tuning.study import enter_study, standing_of, ticket_of
-from sb3_sparse.tuning.tune import define
 from sb3_sparse.tuning.worker import TooManyFailures, work
 
 GRID = dict(weight_decay=[0.0, 1e-4], update_interval=[100, 200, 400])
