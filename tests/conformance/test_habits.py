@@ -554,3 +554,22 @@ def test_a_target_keeps_the_connections_of_its_network_whatever_masks_it_is_give
     assert_masked(model)
     for ours, target in zip(model.q_net.parameters(), model.q_net_target.parameters(), strict=True):
         assert ours.shape == target.shape
+
+
+@pytest.mark.parametrize("name", ["DQN", "SAC"])
+def test_a_target_never_has_more_connections_than_its_network(name):
+    model, dense = make(name), make(name, policy="MlpPolicy")
+    part, target = ("q_net", "q_net_target") if name == "DQN" else ("critic", "critic_target")
+
+    def check() -> None:
+        for layer in model.policy.sparse.layers:
+            for module in layer.targets:
+                assert int(module.state_dict()["weight"].count_nonzero()) <= layer.nnz
+
+    getattr(model, target).load_state_dict(getattr(dense, part).state_dict())
+    check()
+    with pytest.warns(UserWarning, match="were dropped"):
+        model.policy.load_from_vector(np.ones(model.policy.parameters_to_vector().size))
+    check()
+    model.learn(40)
+    check()

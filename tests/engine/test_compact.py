@@ -204,6 +204,21 @@ def test_either_storage_takes_up_what_the_other_saved(first):
     same(masked, fresh)
 
 
+def test_loaded_moments_follow_a_move_that_comes_before_any_step():
+    other = twins(seed=5)[0]
+    step(other, 3)
+    masked, compact = twins()
+    for side in (masked, compact):
+        step(side)
+        side.optimizer.zero_grad()
+        side.module.load_state_dict(other.module.state_dict())
+        side.optimizer.load_state_dict(copy.deepcopy(other.optimizer.state_dict()))
+    exchange = exchange_of(masked.layer, 3, 2)
+    for side in (masked, compact):
+        side.layer.move(exchange, [side.optimizer])
+    same(masked, compact)
+
+
 def test_weights_without_a_mask_are_masked():
     _, compact = twins()
     dense = nn.Linear(COLUMNS, ROWS).state_dict()
