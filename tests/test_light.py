@@ -73,6 +73,19 @@ def test_a_package_that_is_imported_before_sb3_registers_its_policies_all_the_sa
     assert done.stdout.strip() == "[]", done.stderr
 
 
+def test_packages_of_environments_find_the_policies_registered_in_a_command(tmp_path):
+    (tmp_path / "with_opponent.py").write_text(
+        "import gymnasium\n"
+        "import sb3_sparse\n"
+        "from stable_baselines3 import PPO\n"
+        "OPPONENT = PPO('SparsePolicy', 'CartPole-v1', policy_kwargs=dict(sparsity=0.9))\n"
+        "gymnasium.register('Against-v0', 'gymnasium.envs.classic_control:CartPoleEnv')\n"
+    )
+    env = ["--env", "with_opponent:Against-v0", "--method", "riggle"]
+    done = run(f"import sys\nsys.path.insert(0, '')\n{COMMAND}", "train", *env, cwd=tmp_path)
+    assert "no config is shipped for method 'riggle'" in done.stderr
+
+
 EVERYTHING = """
 import json, logging, os, pkgutil, signal, sys, types, warnings
 from importlib import import_module

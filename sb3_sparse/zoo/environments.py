@@ -67,6 +67,9 @@ def import_packages(names: Iterable[str]) -> None:
     :raises ConfigError: if one is not there, or fails
     """
     for name in names:
+        # The user's code may name SparsePolicy, whose registration the command line puts off.
+        import sb3_sparse.policies.aliases  # noqa: F401
+
         try:
             importlib.import_module(name)
         except ModuleNotFoundError as error:

@@ -54,8 +54,11 @@ def test_each_trial_trains_with_the_configs_sparsity(algo, tmp_path):
 
 
 def test_without_it_the_sparsity_is_missed_and_a_stock_policy_is_left_alone(tmp_path):
-    done = optimize("dqn", CONFIG.format(env="CartPole-v1"), tmp_path)
-    assert "a sparse policy needs its sparsity" in done.stderr + done.stdout
+    config = CONFIG.format(env="CartPole-v1")
+    done = optimize("dqn", config, tmp_path, "--gym-packages", "sb3_sparse.zoo")
+    assert done.returncode != 0
+    assert "a sparse policy needs its sparsity" in done.stderr
+    assert "add --gym-packages sb3_sparse.rl_zoo_optimize" in done.stderr
     stock = "CartPole-v1:\n  n_timesteps: 300\n  policy: MlpPolicy\n"
     stock += "  policy_kwargs: {net_arch: [17], normalize_images: False}\n"
     done = optimize("dqn", stock, tmp_path, "--gym-packages", "sb3_sparse.rl_zoo_optimize")
