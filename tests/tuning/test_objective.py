@@ -249,7 +249,8 @@ def test_an_environment_that_does_not_work_is_found_before_any_worker(tmp_path):
 
 @pytest.mark.parametrize("missing", ["optuna", "ruamel.yaml", "plotly"])
 def test_a_missing_extra_names_its_cure(missing):
-    code = f"import sys; sys.modules[{missing!r}] = None\nimport sb3_sparse.tuning"
+    hidden = f"import sys; sys.modules[{missing!r}] = None"
+    code = f"{hidden}\nfrom sb3_sparse.tuning import tune, write_report"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 1
     assert "sb3-sparse[" in done.stderr.splitlines()[-1]
