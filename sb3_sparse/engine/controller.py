@@ -230,7 +230,7 @@ class Controller:
             if network.optimizer is not optimizer:
                 continue
             network.clock += 1
-            if network.denser and self.plan is None and not self._warned:
+            if self.plan is None and not self._warned and network.denser:
                 self._warned = True
                 warn_of_no_plan(self.sparsity)
             for layer in network.layers:
