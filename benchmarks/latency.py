@@ -27,8 +27,8 @@ import onnx
 import onnxruntime
 import torch as th
 from gymnasium import spaces
+from random_env import RandomEnv
 from stable_baselines3 import SAC
-from step_overhead import RandomEnv
 
 from sb3_sparse import SparsePolicy
 from sb3_sparse.export import export

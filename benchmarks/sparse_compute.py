@@ -16,7 +16,6 @@ import copy
 import csv
 import gc
 import re
-import time
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from functools import partial
@@ -27,8 +26,10 @@ from typing import Any
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from random_env import TORQUES, VECTOR, RandomEnv
+from rounds import appending, interleaved, listed
 from stable_baselines3 import DQN, SAC, TD3
-from step_overhead import TORQUES, VECTOR, RandomEnv, fused_like_stock, off_policy, on_policy
+from step_overhead import fused_like_stock, off_policy, on_policy
 from torch.nn import functional
 
 from sb3_sparse.engine.chains import Chain
@@ -39,17 +40,6 @@ from sb3_sparse.engine.structure import Structure
 from sb3_sparse.sparsity.widths import equivalent_widths
 
 Variant = tuple[Any, Callable[[], None], int]
-
-
-def interleaved(steps: dict[str, Callable[[], Any]], rounds: int) -> dict[str, list[float]]:
-    """Seconds of each, ``rounds`` times in turn, after one round to warm up."""
-    times: dict[str, list[float]] = {name: [] for name in steps}
-    for _ in range(rounds + 1):
-        for name, step in steps.items():
-            start = time.perf_counter()
-            step()
-            times[name].append(time.perf_counter() - start)
-    return {name: found[1:] for name, found in times.items()}
 
 
 def rows_of(
@@ -310,16 +300,13 @@ FIELDS = ["what", "case", "batch", "sparsity", "variant", "milliseconds", "speed
 
 
 def main() -> None:
-    def numbers(kind: Callable[[str], Any]) -> Callable[[str], list[Any]]:
-        return lambda text: [kind(part) for part in text.split(",")]
-
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--layers", action="store_true", help="only layers")
     parser.add_argument("--steps", action="store_true", help="only gradient steps")
     parser.add_argument("--learn", action="store_true", help="only learn() on HalfCheetah-v5")
-    parser.add_argument("--algos", type=numbers(str), default=["SAC", "TD3", "DQN", "PPO"])
-    parser.add_argument("--widths", type=numbers(int), default=[256, 1024])
-    parser.add_argument("--sparsities", type=numbers(float), default=[0.8, 0.9, 0.95, 0.99])
+    parser.add_argument("--algos", type=listed(str), default=["SAC", "TD3", "DQN", "PPO"])
+    parser.add_argument("--widths", type=listed(int), default=[256, 1024])
+    parser.add_argument("--sparsities", type=listed(float), default=[0.8, 0.9, 0.95, 0.99])
     parser.add_argument("--rounds", type=int, default=9)
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--csv", type=Path, default=Path("sparse_compute.csv"))
@@ -347,15 +334,10 @@ def main() -> None:
         ]
     if args.learn:
         rows.append(time_learn(1024, 0.95, 100, args.rounds))
-    new = not args.csv.exists()
-    with args.csv.open("a", newline="") as file:
-        writer = csv.DictWriter(file, FIELDS)
-        if new:
-            writer.writeheader()
+    with appending(args.csv, FIELDS) as write:
         for part in rows:
             for row in part:
-                writer.writerow(row)
-                file.flush()
+                write(row)
                 print(
                     f"{row['what']:<5} {row['case']:<26} batch {row['batch']:>3}  "
                     f"{row['sparsity']:.0%}  {row['variant']:<20} {row['milliseconds']:9.3f} ms  "

@@ -16,35 +16,16 @@ from statistics import median
 from typing import Any
 
 import gymnasium as gym
-import numpy as np
 import torch as th
 from gymnasium import spaces
+from random_env import IMAGE, TORQUES, VECTOR, RandomEnv
+from rounds import interleaved
 from stable_baselines3 import DQN, PPO, SAC
 
 import sb3_sparse  # noqa: F401  (registers SparsePolicy)
 from sb3_sparse import SparsityCallback
 
 SPARSITY = 0.9
-
-
-class RandomEnv(gym.Env):
-    """Noise of the given spaces; the gradient step does not care what it learns from."""
-
-    def __init__(self, observation_space: spaces.Space, action_space: spaces.Space) -> None:
-        self.observation_space = observation_space
-        self.action_space = action_space
-
-    def reset(self, **kwargs: Any) -> tuple[np.ndarray, dict[str, Any]]:
-        super().reset(seed=kwargs.get("seed"))
-        return self.observation_space.sample(), {}
-
-    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        return self.observation_space.sample(), float(np.random.randn()), False, False, {}
-
-
-VECTOR = spaces.Box(-1.0, 1.0, (17,), np.float32)
-IMAGE = spaces.Box(0, 255, (4, 84, 84), np.uint8)
-TORQUES = spaces.Box(-1.0, 1.0, (6,), np.float32)
 
 
 def off_policy(algo: Any, env: gym.Env, batch: int, steps: int, **settings: Any) -> Callable:
@@ -109,18 +90,12 @@ def time_case(name: str, rounds: int) -> dict[str, tuple[float, float]]:
         "masked, fused Adam": make("SparsePolicy", dict(SPARSE)),
         "masked, SB3's Adam": make("SparsePolicy", dict(SPARSE, optimizer_kwargs=eager)),
     }
-    times: dict[str, list[float]] = {variant: [] for variant in variants}
-    for _ in range(rounds + 1):
-        for variant, (_, train, steps) in variants.items():
-            start = time.perf_counter()
-            train()
-            times[variant].append((time.perf_counter() - start) / steps)
-    for values in times.values():
-        values.pop(0)  # warm-up
+    times = interleaved({variant: train for variant, (_, train, _) in variants.items()}, rounds)
+    steps = stock[2]
     base = times["dense, stock"]
     return {
         variant: (
-            1e3 * median(values),
+            1e3 * median(values) / steps,
             median(value / reference for value, reference in zip(values, base, strict=True)),
         )
         for variant, values in times.items()

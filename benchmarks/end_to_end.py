@@ -1,0 +1,334 @@
+"""``learn()`` from end to end: stock SB3, this package, and SBX, which is SB3 in JAX.
+
+Every contender lives in a process of its own. All share one core and one thread, learn in turn, a
+few seconds a round, and are past the steps at which learning starts and SBX compiles. Of the rates,
+round by round, the medians and the ranges count. Two parts of a step are timed as well, where they
+are to be had: the rollout part, which is all that is not ``train()``, and within it the choice of
+the action (``predict`` off policy, ``forward`` on policy). Rows are appended to a CSV file as they
+come.
+
+A case is ``ALGORITHM-NETWORK`` or ``ALGORITHM-NETWORK@ENVIRONMENT``. The network is the width of
+two layers, or ``nature`` or ``impala`` for images of noise. Hyperparameters are SB3's defaults,
+except that ``dqn`` takes a gradient step of 128 samples at every step of the environment; ``dqn4``
+takes one of 32 samples at every fourth, which is SB3's default.
+
+    python benchmarks/end_to_end.py                                   # half an hour
+    python benchmarks/end_to_end.py --cases sac-256,ppo-64@CartPole-v1 --sparsity 0,0.9,0.95
+    python benchmarks/end_to_end.py --cases sac-128 --activation elu --method rigl
+    python benchmarks/end_to_end.py --sbx sbx/bin/python              # SBX too
+    python benchmarks/end_to_end.py --grid --csv grid.csv             # never slower? Hours
+    python benchmarks/end_to_end.py --table end_to_end.csv            # as Markdown
+
+SBX wants a virtual environment of its own:
+
+    python -m venv sbx && sbx/bin/pip install sbx-rl "gymnasium[mujoco]"
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import os
+import subprocess
+import sys
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from learner import ACTIVATIONS, ALGORITHMS, IMAGES
+from rounds import appending, in_turn, listed
+
+HERE = Path(__file__).parent
+SBX = 'python -m venv sbx && sbx/bin/pip install sbx-rl "gymnasium[mujoco]"'
+CARTPOLE = "CartPole-v1"
+CASES: dict[str, list[float]] = {
+    "sac-256": [0.0, 0.9],
+    "sac-1024": [0.9, 0.95],
+    "td3-256": [0.0, 0.9],
+    "tqc-256": [0.9],
+    "dqn-512": [0.0, 0.9],
+    "dqn4-512": [0.9],
+    "ppo-64": [0.0, 0.9],
+    "ppo-256": [0.9],
+    f"ppo-64@{CARTPOLE}": [0.9],
+    f"ppo-256@{CARTPOLE}": [0.9],
+    "a2c-64": [0.0, 0.9],
+    "dqn4-nature": [0.0, 0.9],
+    "dqn4-impala": [0.0, 0.9],
+}
+"""Sparsities by case."""
+GRID_ALGORITHMS = ("sac", "td3", "tqc", "dqn", "dqn4", "ppo", "a2c")
+GRID_WIDTHS = (32, 64, 128, 256, 512, 1024)
+GRID_SPARSITIES = [0.0, 0.5, 0.8, 0.9, 0.95, 0.99]
+FIELDS = [
+    *("case", "env", "activation", "sparsity", "contender", "rounds", "steps"),
+    *("steps_per_second", "lowest", "highest", "ratio", "ratio_lowest", "ratio_highest"),
+    *("rollout_us", "rollout_ratio", "act_us", "act_ratio"),
+]
+
+
+class Worker:
+    """A process that keeps models and trains them when asked."""
+
+    def __init__(self, python: str) -> None:
+        flags = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
+        threads = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+        self.process = subprocess.Popen(
+            [python, str(HERE / "learner.py")],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env={**os.environ, **threads, "XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"},
+        )
+
+    def ask(self, **request: Any) -> Any:
+        """The answer to a request.
+
+        :raises SystemExit: if the process ends instead; why stands on stderr
+        """
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        with suppress(BrokenPipeError):  # it has ended: there is no answer either
+            print(json.dumps(request), file=self.process.stdin, flush=True)
+        line = self.process.stdout.readline()
+        if not line:
+            code = self.process.wait()
+            raise SystemExit(f"end_to_end: a worker ended with code {code}; it says why above")
+        return json.loads(line)
+
+    def close(self) -> None:
+        self.process.communicate()  # which closes its stdin, and so ends it
+
+
+def parsed(case: str) -> tuple[str, str, str]:
+    """Algorithm, network and environment of a case.
+
+    :raises ValueError: if it is none
+    """
+    name, _, env = case.partition("@")
+    algo, _, net = name.partition("-")
+    if algo not in ALGORITHMS:
+        raise ValueError(f"case {case!r}: the algorithm is one of {', '.join(ALGORITHMS)}")
+    discrete = "dqn" in algo
+    if net in IMAGES:
+        if env:
+            raise ValueError(f"case {case!r}: {net} takes images of noise, so name no environment")
+        if not discrete and ALGORITHMS[algo][0] not in ("PPO", "A2C"):
+            raise ValueError(f"case {case!r}: image networks go with DQN, QRDQN, PPO and A2C")
+        return algo, net, "noise"
+    if not net.isdecimal() or int(net) == 0:
+        nets = ", ".join(sorted(IMAGES))
+        raise ValueError(f"case {case!r}: the network is a width, such as 256, or one of {nets}")
+    return algo, net, env or (CARTPOLE if discrete else "HalfCheetah-v5")
+
+
+def measure(
+    plan: tuple[str, str | None, list[float]], workers: dict[str, Worker], args: argparse.Namespace
+) -> list[dict[str, Any]]:
+    """Rows of the CSV file: stock first, then ours by sparsity, then SBX if it has such a case."""
+    case, activation, sparsities = plan
+    algo, net, env = parsed(case)
+    rollout = 256 if args.grid else 2048
+    shared = dict(algo=algo, net=net, env=env, activation=activation, rollout=rollout)
+    stock: dict[str, Any] = {"contender": "stock", "sparsity": ""}
+    contenders = [stock]
+    contenders += [{"contender": "ours", "sparsity": sparsity} for sparsity in sparsities]
+    contenders += [{"contender": "sbx", "sparsity": ""}] if "sbx" in workers else []
+    asked = {f"{who['contender']} {who['sparsity']}".strip(): who for who in contenders}
+    made = set()
+    for kind, worker in workers.items():
+        specs = {
+            key: {**shared, "kind": kind, "sparsity": who["sparsity"], "method": args.method}
+            for key, who in asked.items()
+            if who["contender"] == kind
+        }
+        made.update(worker.ask(make=specs))
+    rate = rate_of(workers["stock"].ask(learn="stock", steps=10))
+    steps = max(10, round(rate * args.seconds))
+    found = in_turn(
+        {
+            key: partial(workers[who["contender"]].ask, learn=key, steps=steps)
+            for key, who in asked.items()
+            if key in made
+        },
+        args.rounds,
+    )
+    common = {"case": case, "env": env, "activation": activation or "", "rounds": args.rounds}
+    return [
+        {**common, **asked[key], **summary(times, found["stock"])} for key, times in found.items()
+    ]
+
+
+def rate_of(times: dict[str, float]) -> float:
+    """Steps a second."""
+    return times["steps"] / times["seconds"]
+
+
+def summary(rounds: list[dict[str, float]], stock: list[dict[str, float]]) -> dict[str, Any]:
+    """Medians and ranges, and medians of the ratios to stock, round by round."""
+
+    def rollout(times: dict[str, float]) -> float:
+        return (times["seconds"] - times["train"]) / times["steps"]
+
+    def act(times: dict[str, float]) -> float:
+        return times["act"] / times["steps"]
+
+    rates = [rate_of(times) for times in rounds]
+    pairs = list(zip(rounds, stock, strict=True))
+    ratios = [rate_of(times) / rate_of(base) for times, base in pairs]
+    return {
+        "steps": rounds[0]["steps"],
+        "steps_per_second": median(rates),
+        "lowest": min(rates),
+        "highest": max(rates),
+        "ratio": median(ratios),
+        "ratio_lowest": min(ratios),
+        "ratio_highest": max(ratios),
+        "rollout_us": 1e6 * median(map(rollout, rounds)),
+        "rollout_ratio": median(rollout(times) / rollout(base) for times, base in pairs),
+        "act_us": 1e6 * median(map(act, rounds)),
+        "act_ratio": median(act(times) / act(base) for times, base in pairs),
+    }
+
+
+def line(row: dict[str, Any]) -> str:
+    """A row for people; ours is flagged where it is slower than stock."""
+    name = row["contender"] + (f" {row['sparsity']:.0%}" if row["sparsity"] != "" else "")
+    where = f"{row['case']} {row['activation']}"
+    flag = ""
+    if row["contender"].startswith("ours") and row["ratio"] < 1:
+        flag = "  SLOWER" if row["ratio_highest"] < 1 else "  slower in the median"
+    return (
+        f"{where:<22} {row['env']:<15} {name:<9} {row['steps_per_second']:8.1f} steps/s "
+        f"({row['lowest']:.1f} to {row['highest']:.1f}), {row['ratio']:.2f} of stock "
+        f"({row['ratio_lowest']:.2f} to {row['ratio_highest']:.2f}); rollout "
+        f"{row['rollout_us']:.0f} us ({row['rollout_ratio']:.2f}), action {row['act_us']:.0f} us "
+        f"({row['act_ratio']:.2f}){flag}"
+    )
+
+
+def table(path: Path) -> None:
+    """Print what a CSV file holds as Markdown: a line for each case and sparsity."""
+    found: dict[tuple[str, ...], dict[tuple[str, str], dict[str, str]]] = {}
+    with path.open(newline="") as file:
+        for row in csv.DictReader(file):
+            key = (row["case"].partition("@")[0], row["env"], row["activation"])
+            found.setdefault(key, {})[row["contender"], row["sparsity"]] = row
+
+    def rates(row: dict[str, str] | None) -> str:
+        if row is None:
+            return ""
+        numbers = [float(row[name]) for name in ("steps_per_second", "lowest", "highest")]
+        return "{} ({} to {})".format(*(f"{number:.4g}" for number in numbers))
+
+    print(
+        "| case | environment | sparsity | stock, steps/s | SBX | ours | SBX / stock "
+        "| ours / stock | rollout part, us: stock, ours, ratio | action, us: stock, ours, ratio |"
+    )
+    print("|---" * 10 + "|")
+    for (case, env, activation), rows in found.items():
+        stock, sbx = rows["stock", ""], rows.get(("sbx", ""))
+        for (contender, sparsity), ours in rows.items():
+            if contender in ("stock", "sbx"):
+                continue
+            cells = [f"{case} {activation}".strip(), env, f"{float(sparsity):.0%}"]
+            if contender != "ours":
+                cells[2] += contender.removeprefix("ours")
+            cells += [rates(stock), rates(sbx), rates(ours)]
+            cells.append(f"{float(sbx['ratio']):.2f}" if sbx else "")
+            cells.append(f"**{float(ours['ratio']):.2f}**")
+            for part in ("rollout", "act"):
+                both = [f"{float(row[f'{part}_us']):.0f}" for row in (stock, ours)]
+                cells.append(", ".join([*both, f"{float(ours[f'{part}_ratio']):.2f}"]))
+            print("| " + " | ".join(cells) + " |")
+
+
+def check_sbx(parser: argparse.ArgumentParser, python: str) -> None:
+    """End with a message if that is no Python in which SBX and MuJoCo can be imported."""
+    try:
+        tried = subprocess.run(
+            [python, "-c", "import sbx, mujoco"], capture_output=True, text=True, check=False
+        )
+    except OSError as error:
+        parser.error(f"--sbx: {python} cannot be run ({error}); make one with: {SBX}")
+    if tried.returncode:
+        why = (tried.stderr.strip().splitlines() or [f"code {tried.returncode}"])[-1]
+        parser.error(f"--sbx: {python} is no Python with SBX ({why}); make one with: {SBX}")
+
+
+def arguments() -> tuple[argparse.Namespace, list[tuple[str, str | None, list[float]]]]:
+    """What was asked for, and what is to be measured: case, activation, sparsities."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--cases", type=listed(str), help=f"default {','.join(CASES)}")
+    parser.add_argument("--sparsity", type=listed(float), help="of ours (default by case)")
+    parser.add_argument("--activation", type=listed(str), help="default: SB3's")
+    parser.add_argument("--method", choices=["set", "rigl"], help="default: the mask stays")
+    parser.add_argument("--sbx", metavar="PYTHON", help=f"made with: {SBX}")
+    parser.add_argument("--grid", action="store_true", help="all widths and activations, few steps")
+    parser.add_argument("--rounds", type=int, help="default 9; 5 with --grid")
+    parser.add_argument("--seconds", type=float, help="of stock a round (default 4; 0.5)")
+    cores = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else set()  # else no Linux
+    parser.add_argument("--core", type=int, choices=cores, help="default: the last")
+    parser.add_argument("--csv", type=Path, default=Path("end_to_end.csv"))
+    parser.add_argument("--table", type=Path, help="only print such a CSV file as Markdown")
+    args = parser.parse_args()
+    if args.table is not None and not args.table.is_file():
+        parser.error(f"--table: there is no file {args.table}")
+    if args.rounds is None:
+        args.rounds = 5 if args.grid else 9
+    if args.seconds is None:
+        args.seconds = 0.5 if args.grid else 4.0
+    if args.rounds < 1 or args.seconds <= 0:
+        parser.error("--rounds is 1 or more, and --seconds above 0")
+    if args.core is None and cores:
+        args.core = max(cores)
+    images = [case for case in CASES if case.partition("-")[2] in IMAGES]
+    grid = [f"{algo}-{width}" for algo in GRID_ALGORITHMS for width in GRID_WIDTHS] + images
+    cases = args.cases or (grid if args.grid else list(CASES))
+    activations = args.activation or (list(ACTIVATIONS) if args.grid else [None])
+    unknown = [name for name in activations if name not in (None, *ACTIVATIONS)]
+    if unknown:
+        parser.error(f"--activation: one of {', '.join(ACTIVATIONS)}; got {', '.join(unknown)}")
+    wrong = [value for value in args.sparsity or () if not 0 <= value < 1]
+    if wrong:
+        parser.error(f"--sparsity: from 0 to below 1, got {wrong[0]}")
+    plan = []
+    for case in cases:
+        try:
+            net = parsed(case)[1]
+        except ValueError as error:
+            parser.error(str(error))
+        sparsities = args.sparsity or (GRID_SPARSITIES if args.grid else CASES.get(case, [0.9]))
+        plan += [(case, name, sparsities) for name in ([None] if net in IMAGES else activations)]
+    if args.sbx is not None and args.table is None:
+        check_sbx(parser, args.sbx)
+    return args, plan
+
+
+def main() -> None:
+    args, plan = arguments()
+    if args.table is not None:
+        table(args.table)
+        return
+    if args.core is not None:
+        os.sched_setaffinity(0, {args.core})  # the workers inherit it
+    pythons = {"stock": sys.executable, "ours": sys.executable}
+    if args.sbx is not None:
+        pythons["sbx"] = args.sbx
+    workers = {kind: Worker(python) for kind, python in pythons.items()}
+    with appending(args.csv, FIELDS) as write:
+        for part in plan:
+            for row in measure(part, workers, args):
+                if row["contender"] == "ours" and args.method:
+                    row["contender"] += f", {args.method}"
+                write(row)
+                print(line(row), flush=True)
+    for worker in workers.values():
+        worker.close()
+
+
+if __name__ == "__main__":
+    main()

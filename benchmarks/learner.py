@@ -1,0 +1,183 @@
+"""The other side of end_to_end.py: a process that trains models when asked.
+
+It reads one request a line from stdin, as JSON, and answers each with one line. Whatever a library
+prints goes to stderr. It imports only what its models need: an environment with SBX has no
+sb3_sparse.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import json
+import os
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+from random_env import IMAGE, RandomEnv
+
+ACTIVATIONS = {"relu": "ReLU", "tanh": "Tanh", "elu": "ELU", "silu": "SiLU"}
+"""Class of torch.nn by name; flax has functions of the lower-case names."""
+OFF = dict(learning_starts=100, buffer_size=20_000)
+PPO = dict(n_steps=2048, batch_size=64, n_epochs=10)
+ALGORITHMS: dict[str, tuple[str, dict[str, Any]]] = {
+    "sac": ("SAC", OFF),
+    "td3": ("TD3", OFF),
+    "ddpg": ("DDPG", OFF),
+    "tqc": ("TQC", OFF),
+    "crossq": ("CrossQ", OFF),
+    "qrdqn": ("QRDQN", dict(OFF, train_freq=1, batch_size=128)),
+    "dqn": ("DQN", dict(OFF, train_freq=1, batch_size=128)),
+    "dqn4": ("DQN", OFF),
+    "ppo": ("PPO", PPO),
+    "a2c": ("A2C", {}),
+    "trpo": ("TRPO", {}),
+}
+"""Class and settings; what is not set is SB3's default: gradient steps too, but for ``dqn`` and
+``qrdqn``, which train at every step of the environment."""
+IMAGES = {"nature", "impala"}
+"""Networks that take images, from an environment of noise."""
+
+
+def algorithm(kind: str, name: str) -> Any:
+    """The class from SBX, SB3 or sb3-contrib; None where there is none."""
+    modules = ["sbx"] if kind == "sbx" else ["stable_baselines3", "sb3_contrib"]
+    for module in modules:
+        try:
+            found = getattr(importlib.import_module(module), name, None)
+        except ModuleNotFoundError as error:
+            if error.name != module:
+                raise
+            found = None
+        if found is not None:
+            return found
+    return None
+
+
+def network(kind: str, net: str, activation: str | None) -> dict[str, Any]:
+    """Policy arguments for two layers of ``net`` units, or for an image network."""
+    found: dict[str, Any] = {}
+    if net == "impala":
+        from sb3_sparse.networks import ImpalaCNN
+
+        found = dict(features_extractor_class=ImpalaCNN, net_arch=[])
+    elif net == "nature":
+        found = dict(net_arch=[512]) if kind == "sbx" else {}  # SBX counts the extractor's layer
+    else:
+        found = dict(net_arch=[int(net), int(net)])
+    if activation is not None and kind == "sbx":
+        from flax import linen
+
+        found["activation_fn"] = getattr(linen, activation)
+    elif activation is not None:
+        from torch import nn
+
+        found["activation_fn"] = getattr(nn, ACTIVATIONS[activation])
+    return found
+
+
+def build(spec: dict[str, Any]) -> Any:
+    """A model that has not trained yet; None if SBX has none of this kind."""
+    kind, net = spec["kind"], spec["net"]
+    name, settings = ALGORITHMS[spec["algo"]]
+    made = algorithm(kind, name)
+    images = net in IMAGES
+    policy = "CnnPolicy" if images else "MlpPolicy"
+    if made is None or policy not in made.policy_aliases or (kind == "sbx" and net == "impala"):
+        if kind == "sbx":
+            return None
+        raise SystemExit(f"{name} is not installed here; TQC and others need sb3-contrib")
+    kwargs = network(kind, net, spec["activation"])
+    if kind == "ours":
+        importlib.import_module("sb3_sparse")  # registers SparsePolicy
+        policy, kwargs = "SparsePolicy", dict(kwargs, sparsity=spec["sparsity"])
+    settings = dict(settings)
+    if images and "buffer_size" in settings:
+        settings["buffer_size"] = 2000  # 56 kB each
+    if name == "PPO":
+        settings["n_steps"] = spec["rollout"]
+    from gymnasium import spaces
+
+    env = RandomEnv(IMAGE, spaces.Discrete(6)) if images else spec["env"]
+    return made(policy, env, policy_kwargs=kwargs, seed=0, device="cpu", **settings)
+
+
+class Meter:
+    """Seconds spent in the functions that it was put around."""
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+
+    def around(self, function: Callable[..., Any]) -> Callable[..., Any]:
+        @functools.wraps(function)
+        def timed(*args: Any, **kwargs: Any) -> Any:
+            start = time.perf_counter()
+            try:
+                return function(*args, **kwargs)
+            finally:
+                self.seconds += time.perf_counter() - start
+
+        return timed
+
+
+class Learner:
+    """A model, and how long its parts take.
+
+    Three clocks run: around ``learn()``, around ``train()``, and around what chooses an action:
+    ``model.predict`` off policy, ``policy.forward`` on policy (``predict_all`` in SBX).
+    """
+
+    def __init__(self, spec: dict[str, Any], model: Any) -> None:
+        self.model, self.train, self.act = model, Meter(), Meter()
+        self.callback = None
+        if spec["kind"] == "ours" and spec["method"]:
+            from sb3_sparse import SparsityCallback
+
+            self.callback = SparsityCallback(spec["method"], end=1.0)
+        model.train = self.train.around(model.train)
+        if hasattr(model, "replay_buffer"):
+            model.predict = self.act.around(model.predict)
+        else:
+            name = "predict_all" if spec["kind"] == "sbx" else "forward"
+            setattr(model.policy, name, self.act.around(getattr(model.policy, name)))
+        model.learn(getattr(model, "learning_starts", 0) + 20)  # SBX compiles here
+
+    def learn(self, steps: int) -> dict[str, float]:
+        """Seconds of so many steps, at least: on policy they are whole rollouts."""
+        before, start = self.model.num_timesteps, time.perf_counter()
+        self.train.seconds = self.act.seconds = 0.0
+        self.model.learn(steps, callback=self.callback, reset_num_timesteps=False)
+        return {
+            "seconds": time.perf_counter() - start,
+            "steps": self.model.num_timesteps - before,
+            "train": self.train.seconds,
+            "act": self.act.seconds,
+        }
+
+
+def main() -> None:
+    answers = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)
+    import torch as th
+
+    th.set_num_threads(1)
+    learners: dict[str, Learner] = {}
+    for line in sys.stdin:
+        request = json.loads(line)
+        answer: Any
+        if "make" in request:
+            learners.clear()
+            for key, spec in request["make"].items():
+                model = build(spec)
+                if model is not None:
+                    learners[key] = Learner(spec, model)
+            answer = list(learners)
+        else:
+            answer = learners[request["learn"]].learn(request["steps"])
+        print(json.dumps(answer), file=answers, flush=True)
+
+
+if __name__ == "__main__":
+    main()
