@@ -28,20 +28,17 @@ from __future__ import annotations
 
 import argparse
 import csv
-import json
 import os
 import subprocess
 import sys
-from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from statistics import median
 from typing import Any
 
-from learner import ACTIVATIONS, ALGORITHMS, IMAGES
+from learner import ACTIVATIONS, ALGORITHMS, IMAGES, Worker
 from rounds import appending, in_turn, listed
 
-HERE = Path(__file__).parent
 SBX = 'python -m venv sbx && sbx/bin/pip install sbx-rl "gymnasium[mujoco]"'
 CARTPOLE = "CartPole-v1"
 CASES: dict[str, list[float]] = {
@@ -68,39 +65,6 @@ FIELDS = [
     *("steps_per_second", "lowest", "highest", "ratio", "ratio_lowest", "ratio_highest"),
     *("rollout_us", "rollout_ratio", "act_us", "act_ratio"),
 ]
-
-
-class Worker:
-    """A process that keeps models and trains them when asked."""
-
-    def __init__(self, python: str) -> None:
-        flags = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
-        threads = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
-        self.process = subprocess.Popen(
-            [python, str(HERE / "learner.py")],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-            env={**os.environ, **threads, "XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"},
-        )
-
-    def ask(self, **request: Any) -> Any:
-        """The answer to a request.
-
-        :raises SystemExit: if the process ends instead; why stands on stderr
-        """
-        assert self.process.stdin is not None
-        assert self.process.stdout is not None
-        with suppress(BrokenPipeError):  # it has ended: there is no answer either
-            print(json.dumps(request), file=self.process.stdin, flush=True)
-        line = self.process.stdout.readline()
-        if not line:
-            code = self.process.wait()
-            raise SystemExit(f"end_to_end: a worker ended with code {code}; it says why above")
-        return json.loads(line)
-
-    def close(self) -> None:
-        self.process.communicate()  # which closes its stdin, and so ends it
 
 
 def parsed(case: str) -> tuple[str, str, str]:

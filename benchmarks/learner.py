@@ -1,19 +1,22 @@
-"""The other side of end_to_end.py: a process that trains models when asked.
+"""A process that trains models when asked, for end_to_end.py.
 
-It reads one request a line from stdin, as JSON, and answers each with one line. Whatever a library
-prints goes to stderr. It imports only what its models need: an environment with SBX has no
-sb3_sparse.
+``Worker`` starts this file as a program and asks; the program reads one request a line from stdin,
+as JSON, and answers each with one line. Whatever a library prints goes to stderr. It imports only
+what its models need: an environment with SBX has no sb3_sparse.
 """
 
 from __future__ import annotations
 
 import functools
+import gc
 import importlib
 import json
 import os
+import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 from random_env import IMAGE, RandomEnv
@@ -169,6 +172,7 @@ def main() -> None:
         answer: Any
         if "make" in request:
             learners.clear()
+            gc.collect()  # a wrapped model is part of a cycle
             for key, spec in request["make"].items():
                 model = build(spec)
                 if model is not None:
@@ -177,6 +181,39 @@ def main() -> None:
         else:
             answer = learners[request["learn"]].learn(request["steps"])
         print(json.dumps(answer), file=answers, flush=True)
+
+
+class Worker:
+    """The process, seen from the one that asks."""
+
+    def __init__(self, python: str) -> None:
+        flags = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
+        threads = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+        self.process = subprocess.Popen(
+            [python, __file__],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env={**os.environ, **threads, "XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"},
+        )
+
+    def ask(self, **request: Any) -> Any:
+        """The answer to a request.
+
+        :raises SystemExit: if the process ends instead; why stands on stderr
+        """
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        with suppress(BrokenPipeError):  # it has ended: there is no answer either
+            print(json.dumps(request), file=self.process.stdin, flush=True)
+        line = self.process.stdout.readline()
+        if not line:
+            code = self.process.wait()
+            raise SystemExit(f"end_to_end: a worker ended with code {code}; it says why above")
+        return json.loads(line)
+
+    def close(self) -> None:
+        self.process.communicate()  # which closes its stdin, and so ends it
 
 
 if __name__ == "__main__":

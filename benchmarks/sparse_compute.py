@@ -1,4 +1,4 @@
-"""What computing on the non-zeros gains, and which rivals win.
+"""What computing on the non-zeros gains in a layer or a gradient step, and which rivals win.
 
 All variants of a case are timed in turn in one process; the medians of the ratios, round by round,
 are what counts. Rows are appended to a CSV file as they come.
@@ -6,7 +6,6 @@ are what counts. Rows are appended to a CSV file as they come.
     python benchmarks/sparse_compute.py                     # layers, and steps 256 and 1024 wide
     python benchmarks/sparse_compute.py --steps --widths 256,512,1024,2048,4096   # hours
     python benchmarks/sparse_compute.py --steps --algos SAC --widths 256 --rounds 41
-    python benchmarks/sparse_compute.py --learn             # learn() on HalfCheetah-v5, 1024 wide
 """
 
 from __future__ import annotations
@@ -247,31 +246,6 @@ def time_steps(
         gc.collect()
 
 
-# --- learn() end to end -------------------------------------------------------------------------
-
-
-def time_learn(width: int, sparsity: float, steps: int, rounds: int) -> Iterator[dict]:
-    """Environment steps and gradient steps of SAC on HalfCheetah-v5, one each in turn."""
-    kinds = {
-        "dense, stock": ("MlpPolicy", {}),
-        "masked": ("SparsePolicy", dict(sparsity=sparsity, compute="masked")),
-        "auto": ("SparsePolicy", dict(sparsity=sparsity)),
-    }
-    models = {
-        name: SAC(
-            policy, "HalfCheetah-v5", seed=0, learning_starts=300, buffer_size=20_000,
-            policy_kwargs=dict(kwargs, net_arch=[width, width]),
-        ).learn(310)
-        for name, (policy, kwargs) in kinds.items()
-    }  # fmt: skip
-
-    def learn(model: SAC) -> Callable[[], Any]:
-        return lambda: model.learn(steps, reset_num_timesteps=False)
-
-    times = interleaved({name: learn(model) for name, model in models.items()}, rounds)
-    yield from rows_of("learn", f"SAC {width}, HalfCheetah-v5", 256, sparsity, times, steps)
-
-
 def table(path: Path) -> None:
     """Print what a CSV file holds as Markdown: one line a case, one column a variant."""
     with path.open(newline="") as file:
@@ -303,7 +277,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--layers", action="store_true", help="only layers")
     parser.add_argument("--steps", action="store_true", help="only gradient steps")
-    parser.add_argument("--learn", action="store_true", help="only learn() on HalfCheetah-v5")
     parser.add_argument("--algos", type=listed(str), default=["SAC", "TD3", "DQN", "PPO"])
     parser.add_argument("--widths", type=listed(int), default=[256, 1024])
     parser.add_argument("--sparsities", type=listed(float), default=[0.8, 0.9, 0.95, 0.99])
@@ -321,7 +294,7 @@ def main() -> None:
         f"torch {th.__version__}, {args.threads} thread(s), {in_use()} kernels, "
         f"bf16 {'yes' if bf16 else 'no'}, median of {args.rounds} interleaved rounds\n"
     )
-    everything = not (args.layers or args.steps or args.learn)
+    everything = not (args.layers or args.steps)
     rows: list[Iterator[dict]] = []
     if args.layers or everything:
         rows.append(time_layers(args.widths, args.sparsities, args.rounds))
@@ -332,8 +305,6 @@ def main() -> None:
             for width in args.widths
             for algo in args.algos
         ]
-    if args.learn:
-        rows.append(time_learn(1024, 0.95, 100, args.rounds))
     with appending(args.csv, FIELDS) as write:
         for part in rows:
             for row in part:
