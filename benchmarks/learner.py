@@ -108,7 +108,7 @@ def build(spec: dict[str, Any]) -> Any:
 
 
 class Meter:
-    """Seconds spent in the functions that it was put around."""
+    """Processor seconds spent in the functions that it was put around."""
 
     def __init__(self) -> None:
         self.seconds = 0.0
@@ -116,11 +116,11 @@ class Meter:
     def around(self, function: Callable[..., Any]) -> Callable[..., Any]:
         @functools.wraps(function)
         def timed(*args: Any, **kwargs: Any) -> Any:
-            start = time.perf_counter()
+            start = time.process_time()
             try:
                 return function(*args, **kwargs)
             finally:
-                self.seconds += time.perf_counter() - start
+                self.seconds += time.process_time() - start
 
         return timed
 
@@ -138,7 +138,7 @@ class Learner:
         if spec["kind"] == "ours" and spec["method"]:
             from sb3_sparse import SparsityCallback
 
-            self.callback = SparsityCallback(spec["method"], end=1.0)
+            self.callback = SparsityCallback(spec["method"], update_interval=100, end=1.0)
         model.train = self.train.around(model.train)
         if hasattr(model, "replay_buffer"):
             model.predict = self.act.around(model.predict)
@@ -148,12 +148,14 @@ class Learner:
         model.learn(getattr(model, "learning_starts", 0) + 20)  # SBX compiles here
 
     def learn(self, steps: int) -> dict[str, float]:
-        """Seconds of so many steps, at least: on policy they are whole rollouts."""
-        before, start = self.model.num_timesteps, time.perf_counter()
+        """Processor seconds of so many steps, at least: on policy they are whole rollouts."""
+        before = self.model.num_timesteps
+        start, began = time.process_time(), time.perf_counter()
         self.train.seconds = self.act.seconds = 0.0
         self.model.learn(steps, callback=self.callback, reset_num_timesteps=False)
         return {
-            "seconds": time.perf_counter() - start,
+            "seconds": time.process_time() - start,
+            "elapsed": time.perf_counter() - began,
             "steps": self.model.num_timesteps - before,
             "train": self.train.seconds,
             "act": self.act.seconds,

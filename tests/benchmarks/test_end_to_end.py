@@ -35,6 +35,7 @@ def test_a_case_is_measured_from_end_to_end(tmp_path):
     case = ["--cases", "a2c-8@CartPole-v1", "--activation", "silu", "--sparsity", 0.5]
     done = run(*case, *one_round, "--csv", file)
     assert done.returncode == 0, done.stderr
+    assert " of 1 slower than stock" in done.stdout
     with file.open(newline="") as rows:
         stock, ours = csv.DictReader(rows)
     assert [stock["contender"], ours["contender"], ours["sparsity"]] == ["stock", "ours", "0.5"]
@@ -54,14 +55,16 @@ def test_a_case_is_measured_from_end_to_end(tmp_path):
 
 def test_medians_and_ratios_are_taken_round_by_round(end_to_end):
     stock = [
-        dict(steps=10, seconds=1.0, train=0.8, act=0.1),  # 10 a second; rollout 20 ms, action 10
-        dict(steps=10, seconds=2.0, train=1.0, act=0.2),  # 5; 100, 20
-        dict(steps=10, seconds=4.0, train=2.0, act=0.4),  # 2.5; 200, 40
+        dict(
+            steps=10, seconds=1.0, elapsed=1.0, train=0.8, act=0.1
+        ),  # 10 a second; rollout 20 ms, action 10
+        dict(steps=10, seconds=2.0, elapsed=2.0, train=1.0, act=0.2),  # 5; 100, 20
+        dict(steps=10, seconds=4.0, elapsed=4.0, train=2.0, act=0.4),  # 2.5; 200, 40
     ]
     ours = [
-        dict(steps=10, seconds=0.5, train=0.4, act=0.05),  # 20; 10, 5
-        dict(steps=10, seconds=0.5, train=0.1, act=0.3),  # 20; 40, 30
-        dict(steps=10, seconds=5.0, train=2.0, act=1.0),  # 2; 300, 100
+        dict(steps=10, seconds=0.5, elapsed=0.5, train=0.4, act=0.05),  # 20; 10, 5
+        dict(steps=10, seconds=0.5, elapsed=1.0, train=0.1, act=0.3),  # 20; 40, 30
+        dict(steps=10, seconds=5.0, elapsed=6.25, train=2.0, act=1.0),  # 2; 300, 100
     ]
     found = end_to_end.summary(ours, stock)
     assert found["steps_per_second"] == pytest.approx(20)
@@ -72,6 +75,7 @@ def test_medians_and_ratios_are_taken_round_by_round(end_to_end):
     assert found["rollout_ratio"] == pytest.approx(0.5)  # of 0.5, 0.4 and 1.5
     assert found["act_us"] == pytest.approx(30_000)
     assert found["act_ratio"] == pytest.approx(1.5)  # of 0.5, 1.5 and 2.5
+    assert found["core_share"] == pytest.approx(0.8)  # of 1, 0.5 and 0.8
 
 
 @pytest.mark.parametrize(
@@ -84,11 +88,19 @@ def test_medians_and_ratios_are_taken_round_by_round(end_to_end):
     ],
 )
 def test_ours_is_flagged_where_it_is_slower_than_stock(end_to_end, contender, ratio, highest, flag):
-    second = dict(steps=10, seconds=1.0, train=0.5, act=0.1)
+    second = dict(steps=10, seconds=1.0, elapsed=1.0, train=0.5, act=0.1)
     who = dict(case="sac-256", env="HalfCheetah-v5", activation="", sparsity=0.9)
     row = {**who, "contender": contender, **end_to_end.summary([second], [second])}
     line = end_to_end.line({**row, "ratio": ratio, "ratio_highest": highest})
     assert line.partition("action 10000 us (1.00)")[2] == flag
+
+
+def test_a_busy_core_is_said(end_to_end):
+    second = dict(steps=10, seconds=1.0, elapsed=2.0, train=0.5, act=0.1)
+    who = dict(case="a2c-64", env="CartPole-v1", activation="", sparsity="", contender="stock")
+    line = end_to_end.line({**who, **end_to_end.summary([second], [second])})
+    assert "10.0 steps/s" in line
+    assert line.endswith("  had 50% of the core")
 
 
 def test_a_case_names_algorithm_network_and_environment(end_to_end):
