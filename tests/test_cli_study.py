@@ -73,7 +73,12 @@ def test_a_report_of_nothing_is_a_mistake_and_makes_nothing(tmp_path, mistake):
     ("args", "said"),
     [
         (["run", "figure_1"], "unknown study 'figure_1'; allowed are actor_critic"),
-        (["status", "sac", "--scale", "huge"], "has no scale 'huge', only smoke, small, paper"),
+        (
+            ["status", "sac", "--scale", "huge"],
+            "has no scale 'huge', only smoke, small, medium, paper",
+        ),
+        (["run", "snr", "--scale", "medium"], "has no scale 'medium', only smoke, small, paper"),
+        (["report", "snr", "--archive", "no.jsonl"], "there is no file no.jsonl; study run --arch"),
         (["run", "flops", "--launcher", "slurm"], "unknown launcher 'slurm'"),
     ],
 )

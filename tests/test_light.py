@@ -185,6 +185,7 @@ def test_names_that_are_imported_as_needed_are_no_modules(package):
 @pytest.mark.parametrize("name", study_names())
 def test_the_list_of_studies_counts_the_runs_that_there_are(name):
     planned = planned_runs(name)
-    for scale in SCALES:
+    assert set(planned) in (set(SCALES), set(SCALES) - {"medium"})
+    for scale, runs in planned.items():
         study = Study.read(name, scale)
-        assert planned[scale] == len(study.cells) + len(study.merged), scale
+        assert runs == len(study.cells) + len(study.merged), scale

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import shlex
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,7 +13,7 @@ from rich.table import Table
 
 from sb3_sparse.cli.common import INTERRUPTED, Address, GymPackages, Launcher, console, text
 from sb3_sparse.cli.studyprogress import StudyProgress
-from sb3_sparse.errors import ConfigError, MissingExtra
+from sb3_sparse.errors import ConfigError, MissingExtra, command
 from sb3_sparse.experiments import Study
 from sb3_sparse.launch import launcher_named
 
@@ -24,7 +24,19 @@ OVER = ("done", "diverged")
 studies = typer.Typer(no_args_is_help=True)
 Name = Annotated[str, typer.Argument(help="A name of `study list`, or a file of your own, .yml.")]
 Scale = Annotated[
-    str, text("smoke (minutes), small (a night on a laptop) or paper (its seeds and steps).")
+    str,
+    text(
+        "smoke (minutes), small (a night on a laptop), medium (days, of some studies) or paper "
+        "(its seeds and steps)."
+    ),
+]
+Archive = Annotated[
+    Path | None,
+    text(
+        "JSON-lines file of cells that are over, to be committed; they count as done.",
+        "--archive",
+        shown=False,
+    ),
 ]
 Store = Annotated[Path, text("Where runs and reports go; studies share it.", "--folder", "-f")]
 
@@ -37,7 +49,7 @@ def list_() -> None:
     table = Table("study", "what", *SCALES, box=None, header_style="bold")
     for name in study_names():
         runs = planned_runs(name)
-        table.add_row(name, title_of(name), *(str(runs[scale]) for scale in SCALES))
+        table.add_row(name, title_of(name), *(str(runs.get(scale, "")) for scale in SCALES))
     console.print(table)
     console.print("Numbers are runs. Go on with: sb3-sparse study run NAME --scale SCALE")
 
@@ -50,18 +62,19 @@ def run(
     launcher: Launcher = "local",
     address: Address = None,
     store: Store = Path("studies"),
+    archive: Archive = None,
     gym_packages: GymPackages = None,
 ) -> None:
     """Train what a study lacks. What is done stays done; the same command goes on."""
-    packages = gym_packages or []
+    asked = _Asked(name, scale, store, archive, gym_packages or [])
     chosen = launcher_named(launcher, address)
-    study = Study.read(name, scale, packages)
+    study = asked.study()
     from sb3_sparse.experiments import run_study  # not for a mistyped name
 
     if Path(name).suffix:
         _check_figures(study)
     _say_merged(study)
-    runner = run_study(study, store, chosen, workers)
+    runner = run_study(study, store, chosen, workers, archive)
     shown = StudyProgress(console)
     last = None
     try:
@@ -70,14 +83,15 @@ def run(
     except KeyboardInterrupt:
         console.print("Stopping; what is running is kept up to its last checkpoint ...")
         runner.close()
-        console.print(f"Go on with: {_command('run', name, scale, store, packages, workers)}")
+        more = ["--workers", str(workers)] if workers > 1 else []
+        console.print(f"Go on with: {asked.command('run', *more)}", soft_wrap=True)
         raise typer.Exit(INTERRUPTED) from None
     finally:
         shown.close()
     assert last is not None
     if last.elsewhere:
         console.print(f"{last.elsewhere} runs are trained by other processes; look again with:")
-        console.print(_command("status", name, scale, store, packages), soft_wrap=True)
+        console.print(asked.command("status"), soft_wrap=True)
     alike: dict[str, list[str]] = {}
     for failed, error in last.failed.items():
         alike.setdefault(error.rstrip(), []).append(failed)
@@ -88,9 +102,7 @@ def run(
     if last.diverged:
         console.print(f"Diverged, and not run again: {last.diverged}; the report names them.")
     if last.done or last.diverged:
-        console.print(
-            f"Draw them: {_command('report', name, scale, store, packages)}", soft_wrap=True
-        )
+        console.print(f"Draw them: {asked.command('report')}", soft_wrap=True)
     if last.failed:
         raise typer.Exit(1)
 
@@ -100,15 +112,16 @@ def status(
     name: Name,
     scale: Scale = "small",
     store: Store = Path("studies"),
+    archive: Archive = None,
     gym_packages: GymPackages = None,
 ) -> None:
     """How far a study is, and which of its runs failed."""
-    packages = gym_packages or []
-    study = Study.read(name, scale, packages)
+    asked = _Asked(name, scale, store, archive, gym_packages or [])
+    study = asked.study()
     from sb3_sparse.experiments.standing import FAILED, RUNNING, STOPPED, counts
     from sb3_sparse.zoo.record import DIVERGED
 
-    standings = _standings(study, store)
+    standings = asked.standings(study)
     _say_merged(study)
     found = counts(standings)
     console.print(f"{study.title}, scale {scale}: {len(standings)} runs")
@@ -131,28 +144,33 @@ def report(
     name: Name,
     scale: Scale = "small",
     store: Store = Path("studies"),
+    archive: Archive = None,
     out: Annotated[
         Path | None, text("Where it is written.", "--out", "-o", shown="<folder>/<name>/<scale>")
     ] = None,
     gym_packages: GymPackages = None,
 ) -> None:
     """Figures, tables and verdicts of what is done, as one page that opens from disk."""
-    packages = gym_packages or []
-    study = Study.read(name, scale, packages)
+    asked = _Asked(name, scale, store, archive, gym_packages or [])
+    study = asked.study()
     from sb3_sparse.report import write_report
 
-    standings = _standings(study, store)
+    standings = asked.standings(study)
+    archived = {one.folder: one.archived for one in standings if one.archived is not None}
     folders = [one.folder for one in standings if one.folder.is_dir()]
-    if not folders:
-        command = _command("run", name, scale, store, packages)
-        raise ConfigError(f"there is no run of this study in {store} yet; begin with: {command}")
+    if not folders and not archived:
+        where = store if archive is None else f"{store} or {archive}"
+        raise ConfigError(
+            f"there is no run of this study in {where} yet; begin with: {asked.command('run')}"
+        )
     page = write_report(
         folders,
         out or store / study.report_folder,
         title=f"{study.title} ({scale})",
         figures=study.figures,
         varies=study.varies,
-        command=_command("run", name, scale, store, packages),
+        command=asked.command("run"),
+        archived=archived,
         pending=[_pending(one, store) for one in standings if one.status not in OVER],
     )
     console.print(f"Written: {page}", soft_wrap=True)
@@ -180,20 +198,33 @@ def _pending(one: CellStanding, store: Path) -> str:
     return f"{one.cell.name}{failed}"
 
 
-def _standings(study: Study, store: Path) -> list[CellStanding]:
-    from sb3_sparse.experiments import standing_of
+@dataclass(frozen=True)
+class _Asked:
+    """What was asked for on the command line."""
 
-    return [standing_of(cell, store) for cell in study.cells]
+    name: str
+    scale: str
+    store: Path
+    archive: Path | None
+    packages: Sequence[str]
 
+    def study(self) -> Study:
+        return Study.read(self.name, self.scale, self.packages)
 
-def _command(
-    what: str, name: str, scale: str, store: Path, packages: Sequence[str], workers: int = 1
-) -> str:
-    words = ["sb3-sparse", "study", what, name, "--scale", scale]
-    if store != Path("studies"):
-        words += ["--folder", str(store)]
-    for package in packages:
-        words += ["--gym-packages", package]
-    if workers > 1:
-        words += ["--workers", str(workers)]
-    return shlex.join(words)
+    def standings(self, study: Study) -> list[CellStanding]:
+        from sb3_sparse.experiments import standing_of
+        from sb3_sparse.zoo.archive import Archive
+
+        lines = None if self.archive is None else Archive(self.archive).read()
+        return [standing_of(cell, self.store, lines) for cell in study.cells]
+
+    def command(self, what: str, *more: str) -> str:
+        """The same for another command."""
+        words = ["study", what, self.name, "--scale", self.scale]
+        if self.store != Path("studies"):
+            words += ["--folder", str(self.store)]
+        if self.archive is not None:
+            words += ["--archive", str(self.archive)]
+        for package in self.packages:
+            words += ["--gym-packages", package]
+        return command(*words, *more)

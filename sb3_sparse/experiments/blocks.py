@@ -14,7 +14,8 @@ from sb3_sparse.zoo.configs import read_yaml
 from sb3_sparse.zoo.run import Run
 
 SHIPPED = Path(__file__).parent / "studies"
-SCALES = ("smoke", "small", "paper")
+SCALES = ("smoke", "small", "medium", "paper")
+"""Of shipped studies, which have them all but some medium."""
 KEYS = {"title", "figures", "varies", "common", "runs", "scales", "measures", "trained"}
 RUN_KEYS = {one.name for one in fields(Run)} - {"seed", "device", "entry"}
 CHOSEN = ("sparsity", "match_params", "method", "distribution", "algo")

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Generator
+from collections.abc import Generator, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from sb3_sparse.errors import SparsityError, warn
 from sb3_sparse.experiments.cell import Cell
+from sb3_sparse.experiments.measures import FILES
 from sb3_sparse.experiments.spec import Study
 from sb3_sparse.experiments.standing import DONE, RUNNING, standing_of
 from sb3_sparse.launch.base import Ended, Launcher, Task
+from sb3_sparse.zoo.archive import Archive, Archived
 from sb3_sparse.zoo.record import DIVERGED
 
 FUNCTION = "sb3_sparse.experiments.work:work_on"
@@ -55,7 +58,7 @@ class Progress:
 
 
 def run_study(
-    study: Study, store: Path, launcher: Launcher, workers: int
+    study: Study, store: Path, launcher: Launcher, workers: int, archive: Path | None = None
 ) -> Generator[Progress, None, None]:
     """Bring every cell of a study to its end; yields how far it is, about once a second.
 
@@ -67,15 +70,17 @@ def run_study(
     :param store: folder of the studies' runs, which studies share
     :param launcher: runs the processes
     :param workers: how many at a time, 1 or more
+    :param archive: a file of lines (:class:`~sb3_sparse.zoo.archive.Archive`); what it has is done,
+        and each cell that is over becomes a line of it
+    :raises CorruptStateError: if a line of the archive is damaged
     """
-    progress = Progress(len(study.cells))
-    cells = []
-    for cell in study.cells:
-        status = standing_of(cell, store).status
-        progress.done += status == DONE
-        progress.diverged += status == DIVERGED
-        if status not in (DONE, DIVERGED):
-            cells.append(cell)
+    kept = _Kept(store, archive)
+    standings = [standing_of(cell, store, kept.lines) for cell in study.cells]
+    over = [one for one in standings if one.status in (DONE, DIVERGED)]
+    kept.add(one.cell for one in over if one.archived is None)
+    diverged = sum(one.status == DIVERGED for one in over)
+    progress = Progress(len(study.cells), done=len(over) - diverged, diverged=diverged)
+    cells = [one.cell for one in standings if one.status not in (DONE, DIVERGED)]
     yield progress
     again: list[Cell] = []
     for attempt in (1, 2):
@@ -92,8 +97,36 @@ def run_study(
                     again.append(cell)
                     progress.retried.append(cell.name)
                 _account(progress, cell, store, ended, last=attempt == 2)
+                if ended.value in (DONE, DIVERGED):
+                    kept.add([cell])
             progress.running = min(workers, left)
             yield progress
+
+
+class _Kept:
+    """The archive of a study's cells, if there is one.
+
+    :param store: folder of the runs
+    :param path: of the archive; None: nothing is kept
+    """
+
+    def __init__(self, store: Path, path: Path | None) -> None:
+        self.store = store
+        self.archive = None if path is None else Archive(path)
+        self.lines = {} if path is None or not path.exists() else Archive(path).read()
+
+    def add(self, cells: Iterable[Cell]) -> None:
+        """Append cells that are over; of what cannot be read a warning says why."""
+        if self.archive is None:
+            return
+        found = []
+        for cell in cells:
+            folder = cell.folder(self.store)
+            try:
+                found.append(Archived.of_folder(folder, cell.address, FILES.values()))
+            except SparsityError as error:
+                warn(f"{cell.name} does not go into the archive: {error}")
+        self.archive.add(found)
 
 
 def _task(cell: Cell, store: Path) -> Task:

@@ -40,7 +40,7 @@ class Study:
     """What is trained, at one scale, and what is drawn of it.
 
     :param name: of the file
-    :param scale: ``"smoke"``, ``"small"`` or ``"paper"``
+    :param scale: one of its file's, e.g. ``"small"``
     :param title: for its report
     :param figures: names of figures, as :mod:`sb3_sparse.report` has them
     :param varies: the setting that the study varies; None: none but method and sparsity

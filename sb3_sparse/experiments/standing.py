@@ -1,16 +1,18 @@
-"""How far a cell is, by its folder alone."""
+"""How far a cell is, by its line in an archive or by its folder."""
 
 from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from sb3_sparse.errors import SparsityError
 from sb3_sparse.experiments.cell import Cell
 from sb3_sparse.loading.guard import reading
+from sb3_sparse.zoo.archive import Archived, Lines
 from sb3_sparse.zoo.checkpoint import is_locked
 from sb3_sparse.zoo.record import CURE, DIVERGED, NAME, WHAT, read_record
 
@@ -29,6 +31,7 @@ class CellStanding:
         from its last checkpoint), ``"diverged"`` (it is over), ``"failed"`` or ``"waiting"``
     :param steps: environment steps done
     :param reason: what is wrong with its record; None: nothing, or it failed in training
+    :param archived: its line in the archive, if that has all that is wanted of it
     """
 
     cell: Cell
@@ -36,14 +39,20 @@ class CellStanding:
     status: str
     steps: int = 0
     reason: str | None = None
+    archived: Archived | None = None
 
 
-def standing_of(cell: Cell, store: Path) -> CellStanding:
-    """How far a cell is.
+def standing_of(cell: Cell, store: Path, lines: Lines | None = None) -> CellStanding:
+    """How far a cell is. A line in the archive goes before what lies in its folder.
 
     :param store: folder of the studies' runs
+    :param lines: of the archive
     """
     folder = cell.folder(store)
+    for line in reversed((lines or {}).get(cell.address, ())):
+        status, steps = _over(cell, line.record), int(line.record.get("num_timesteps", 0))
+        if status is not None:
+            return CellStanding(cell, folder, status, steps, archived=line)
     failed, running = cell.errors(store).is_file(), is_locked(folder)
     if not (folder / NAME).is_file():
         return CellStanding(cell, folder, RUNNING if running else FAILED if failed else WAITING)
@@ -51,17 +60,21 @@ def standing_of(cell: Cell, store: Path) -> CellStanding:
         record = read_record(folder)
         with reading(folder / NAME, WHAT, CURE):
             steps = int(record.get("num_timesteps", 0))
-            missing = cell.measures.missing(record)
+            status = _over(cell, record)
     except SparsityError as error:  # one damaged record hides no other cell
         told = str(error).replace(f"{store}{os.sep}", "")  # pages name no path of a machine
         return CellStanding(cell, folder, FAILED, reason=told)
     if running:
         return CellStanding(cell, folder, RUNNING, steps)
+    return CellStanding(cell, folder, status or (FAILED if failed else STOPPED), steps)
+
+
+def _over(cell: Cell, record: Mapping[str, Any]) -> str | None:
+    """Whether a run is done with all that is wanted of it, or diverged; None: neither."""
     if record["status"] == DIVERGED:
-        return CellStanding(cell, folder, DIVERGED, steps)
-    if record["status"] == OVER[cell.trained] and not missing:
-        return CellStanding(cell, folder, DONE, steps)
-    return CellStanding(cell, folder, FAILED if failed else STOPPED, steps)
+        return DIVERGED
+    done = record["status"] == OVER[cell.trained] and not cell.measures.missing(record)
+    return DONE if done else None
 
 
 def counts(standings: Sequence[CellStanding]) -> dict[str, int]:

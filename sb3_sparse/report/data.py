@@ -1,4 +1,4 @@
-"""Run folders, read; what cannot be read is named with its reason, never averaged."""
+"""Run folders and archived runs; what cannot be read is named with its reason, never averaged."""
 
 from __future__ import annotations
 
@@ -18,9 +18,10 @@ from sb3_sparse.errors import ConfigError, CorruptStateError, SparsityError
 from sb3_sparse.loading.arrays import read_arrays
 from sb3_sparse.loading.guard import reading
 from sb3_sparse.report.complete import FINISHED, check_complete, check_reached
-from sb3_sparse.report.measured import Rows, read_rows
+from sb3_sparse.report.measured import Rows, measured_text, rows_of
 from sb3_sparse.report.methods import DENSE, EQUAL
 from sb3_sparse.report.settings import WIDTHS, callback_of, family_of, overrides_of, variant_of
+from sb3_sparse.zoo.archive import Archived
 from sb3_sparse.zoo.record import CURE, DIVERGED, NAME, WHAT, read_record
 from sb3_sparse.zoo.results import score_of
 
@@ -170,19 +171,23 @@ class RunData:
         return callback_of(self.settings)
 
 
-def read_runs(folders: Iterable[Path | str]) -> tuple[list[RunData], list[LeftOut]]:
-    """Read run folders.
+def read_runs(
+    folders: Iterable[Path | str], archived: Mapping[Path, Archived] | None = None
+) -> tuple[list[RunData], list[LeftOut]]:
+    """Read run folders, and runs of an archive.
 
     :param folders: each the folder of one run, e.g. ``logs/dqn/CartPole-v1_1``
+    :param archived: runs by the folder that they have or had, which goes before what is in it
     :return: finished and counted runs in a fixed order, and what was left out. Of two runs with the
         same settings and seed the first in the order of folders stays
     """
     runs: list[RunData] = []
     out: list[LeftOut] = []
     first: dict[str, Path] = {}
-    for folder in sorted({Path(folder) for folder in folders}):
+    lines = archived or {}
+    for folder in sorted({*map(Path, folders), *lines}):
         try:
-            run, remarks = _read(folder)
+            run, remarks = _read(folder, lines.get(folder))
         except SparsityError as error:
             told = str(error).replace(f"{folder}{os.sep}", "")
             out.append(LeftOut(folder, told, isinstance(error, _DivergedRun)))
@@ -196,10 +201,10 @@ def read_runs(folders: Iterable[Path | str]) -> tuple[list[RunData], list[LeftOu
     return runs, out
 
 
-def _read(folder: Path) -> tuple[RunData, list[str]]:
-    if not folder.is_dir():
+def _read(folder: Path, archived: Archived | None) -> tuple[RunData, list[str]]:
+    if archived is None and not folder.is_dir():
         raise ConfigError("missing: there is no such folder")
-    record = read_record(folder)
+    record = read_record(folder) if archived is None else archived.record
     empty = np.zeros(0)
     diverged = ""
     with reading(folder / NAME, WHAT, CURE):
@@ -212,18 +217,30 @@ def _read(folder: Path) -> tuple[RunData, list[str]]:
         raise _DivergedRun(diverged)
     timesteps, returns = empty, empty
     if record["status"] == FINISHED:
-        timesteps, returns = _evaluations(folder / "evaluations.npz")
+        timesteps, returns = (
+            _evaluations(folder / "evaluations.npz")
+            if archived is None
+            else (archived.timesteps, archived.returns.mean(axis=1))
+        )
     measured, remarks = {}, []
     for name, columns in MEASURED.items():
-        if (folder / name).is_file():
-            try:
-                measured[name] = read_rows(folder / name, columns)
-            except SparsityError as error:
-                remarks.append(f"only its {name}: {error}; all else of the run is in")
+        try:
+            text = _measured_text(folder / name, archived)
+            if text is not None:
+                measured[name] = rows_of(text, folder / name, columns)
+        except SparsityError as error:
+            remarks.append(f"only its {name}: {error}; all else of the run is in")
     run = RunData(folder, record, timesteps, returns, measured)
     with reading(folder / NAME, WHAT, CURE):
         _try_out(run)
     return run, remarks
+
+
+def _measured_text(path: Path, archived: Archived | None) -> str | None:
+    """Text of a file of measurements; None if the run has none."""
+    if archived is not None:
+        return archived.measured.get(path.name)
+    return measured_text(path) if path.is_file() else None
 
 
 def _divergence(run: RunData) -> str:

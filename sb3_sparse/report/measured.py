@@ -14,17 +14,26 @@ from sb3_sparse.loading.text import read_text
 
 Rows = tuple[dict[str, str], ...]
 TEXT = "name"
+WHAT = "file of measurements"
+CURE = "remove it, or measure anew"
 
 
-def read_rows(path: Path, columns: Sequence[str]) -> Rows:
-    """Rows of a CSV file that has at least these columns.
+def measured_text(path: Path) -> str:
+    """Text of a file of measurements.
 
-    :raises ConfigError: if a column is missing, or a cell is no number
     :raises CorruptStateError: if it is no text
     """
-    cure = "remove it, or measure anew"
-    text = read_text(path, "file of measurements", cure)
-    with reading(path, "file of measurements", cure):
+    return read_text(path, WHAT, CURE)
+
+
+def rows_of(text: str, path: Path, columns: Sequence[str]) -> Rows:
+    """Rows of a CSV text that has at least these columns.
+
+    :param path: of the file that it is of, for messages
+    :raises ConfigError: if a column is missing, or a cell is no number
+    :raises CorruptStateError: if it is no table
+    """
+    with reading(path, WHAT, CURE):
         reader = csv.DictReader(io.StringIO(text, newline=""))
         rows = tuple(reader)
         heads = reader.fieldnames or ()

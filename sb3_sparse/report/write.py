@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from sb3_sparse.errors import ConfigError
@@ -12,6 +12,7 @@ from sb3_sparse.report.page import Content, Shown, render
 from sb3_sparse.report.study import Study
 from sb3_sparse.report.tables import cells_table, runs_table, verdicts_table, write_csv
 from sb3_sparse.report.verdicts import verdicts
+from sb3_sparse.zoo.archive import Archived
 
 FOLDER = "figures"
 
@@ -25,8 +26,9 @@ def write_report(
     varies: str | None = None,
     command: str = "",
     pending: Sequence[str] = (),
+    archived: Mapping[Path, Archived] | None = None,
 ) -> Path:
-    """Write a report on run folders.
+    """Write a report on run folders and archived runs.
 
     It makes ``index.html``, which opens from disk without a network, ``cells.csv``, ``runs.csv``,
     ``verdicts.csv``, and ``figures/<name>`` as PNG, SVG and CSV. A figure that these
@@ -40,6 +42,7 @@ def write_report(
     :param varies: setting that was varied, for the figure ``"sensitivity"``
     :param command: continues what is pending
     :param pending: cells that are planned and not done
+    :param archived: runs by the folder that they have or had, as of :func:`read_runs`
     :return: the page
     :raises ConfigError: for an unknown figure, or an ``out`` that is no folder
     """
@@ -47,7 +50,7 @@ def write_report(
     out = Path(out)
     if out.exists() and not out.is_dir():
         raise ConfigError(f"the report goes into a folder, and {out} is a file; give another name")
-    runs, left_out = read_runs(folders)
+    runs, left_out = read_runs(folders, archived)
     study = Study(tuple(runs), varies)
     found = verdicts(study)
     out.mkdir(parents=True, exist_ok=True)

@@ -52,11 +52,15 @@ def _diverged(folder: Path, env_name: str, model: BaseAlgorithm, error: Diverged
     kept = (
         "no policy was saved before" if step is None else f"the last policy is that of step {step}"
     )
-    text = f"{error}. In {folder} {kept}"
-    steps = model.num_timesteps
-    write_record(folder, status=DIVERGED, error=text, num_timesteps=steps, last_policy=step)
+    write_record(
+        folder,
+        status=DIVERGED,
+        error=f"{error}. In {folder.name} {kept}",  # which other machines read, too
+        num_timesteps=model.num_timesteps,
+        last_policy=step,
+    )
     clear_checkpoints(folder)
-    return Diverged(text)
+    return Diverged(f"{error}. In {folder} {kept}")
 
 
 def _how_to_go_on(folder: Path, model: BaseAlgorithm) -> str:

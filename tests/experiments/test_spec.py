@@ -7,7 +7,7 @@ import yaml
 
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.experiments import Study, study_names
-from sb3_sparse.experiments.blocks import SCALES
+from sb3_sparse.experiments.blocks import SCALES, planned_runs
 
 MINIMAL = {
     "title": "A title",
@@ -185,7 +185,7 @@ def test_every_study_of_the_issue_is_shipped():
 
 
 @pytest.mark.parametrize("name", study_names())
-@pytest.mark.parametrize("scale", SCALES)
+@pytest.mark.parametrize("scale", ["smoke", "small", "paper"])
 def test_every_shipped_study_reads_at_every_scale(name, scale):
     study = Study.read(name, scale)
     assert study.cells
@@ -200,6 +200,35 @@ def test_the_papers_seeds_steps_and_evaluations_are_the_configs_own():
     for cell in study.cells[:20]:
         assert cell.run.settings()["n_timesteps"] == 1_000_000
         assert cell.run.evaluation() == {"eval_freq": 10_000, "eval_episodes": 30}
+
+
+@pytest.mark.parametrize(
+    ("name", "seeds", "steps", "tasks"),
+    [
+        ("classic_control", 10, 100_000, {"CartPole-v1", "Acrobot-v1"}),
+        ("ppo", 10, 1_000_000, {"HalfCheetah-v5", "Hopper-v5", "Walker2d-v5"}),
+        ("sac", 5, 300_000, {"HalfCheetah-v5", "Hopper-v5", "Walker2d-v5"}),
+    ],
+)
+def test_medium_has_all_ways_at_two_sparsities_and_seeds_enough(name, seeds, steps, tasks):
+    cells = Study.read(name, "medium").cells
+    runs = [cell.run for cell in cells]
+    assert [run.seed for run in runs] == sorted([run.seed for run in runs])
+    assert {run.settings()["n_timesteps"] for run in runs} == {steps}
+    found = {(r.method, r.sparsity or r.match_params) for r in runs}
+    assert found == {("dense", None)} | {
+        (method, sparsity)
+        for method in ("dense", "static", "set", "rigl", "prune")
+        for sparsity in (0.9, 0.95)
+    }
+    assert {run.env_id for run in runs} == tasks
+    assert len(cells) == seeds * len(tasks) * 11
+
+
+def test_three_studies_have_a_scale_medium():
+    names = [name for name in study_names() if "medium" in planned_runs(name)]
+    assert names == ["classic_control", "ppo", "sac"]
+    assert set(SCALES) == {scale for name in study_names() for scale in planned_runs(name)}
 
 
 def test_dense_widths_of_the_actor_critic_study_keep_their_budget():

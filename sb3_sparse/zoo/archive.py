@@ -1,0 +1,264 @@
+"""An archive of runs that are over: a JSON-lines file with a line for each, to be committed."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from sb3_sparse.errors import ConfigError, warn
+from sb3_sparse.loading.arrays import read_arrays
+from sb3_sparse.loading.guard import reading
+from sb3_sparse.loading.text import read_text
+from sb3_sparse.zoo.disk import writing
+from sb3_sparse.zoo.evaluation import NPZ
+from sb3_sparse.zoo.record import DIVERGED, read_record
+
+Array = npt.NDArray[np.float64]
+Lines = Mapping[str, "Sequence[Archived]"]
+"""The lines of an archive by address, each address's in the order of the file."""
+WHAT = "line of an archive"
+CURE = "restore it from a copy, or remove the line: its run counts as not done then"
+STATUSES = ("finished", "counted", DIVERGED)
+DECIMALS = 6  # of returns, as SB3's Monitor rounds them
+BEGINNING = b'{"address"'
+
+
+@dataclass(frozen=True, eq=False)
+class Archived:
+    """All that is kept of a run; its models are not.
+
+    :param address: names what was run
+    :param record: content of its ``sparsity.json``, settings and counts among it
+    :param timesteps: environment steps of each evaluation, shape ``[T]``
+    :param returns: of each evaluation's episodes, shape ``[T, episodes]``
+    :param lengths: steps of these episodes, shape ``[T, episodes]``
+    :param measured: text of its files of measurements, by file name
+    """
+
+    address: str
+    record: Mapping[str, Any]
+    timesteps: Array = field(default_factory=lambda: np.zeros(0))
+    returns: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    lengths: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    measured: Mapping[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def of_folder(cls, folder: Path, address: str, files: Iterable[str]) -> Archived:
+        """Read a run's folder.
+
+        :param files: names of the files of measurements that it may have
+        :raises ConfigError: if there is no run, or it is not over
+        :raises CorruptStateError: if something is damaged
+        """
+        cure = "restore it from a copy, or remove the run's folder and train anew"
+        record = read_record(folder)
+        if record["status"] not in STATUSES:
+            raise ConfigError(f"the run in {folder} is not over: its status is {record['status']}")
+        found: dict[str, Any] = {}
+        if record["status"] == "finished" or (folder / NPZ).is_file():
+            needed = ("timesteps", "results", "ep_lengths")
+            saved = read_arrays(folder / NPZ, "file of evaluations", cure, needed)
+            names = ("timesteps", "returns", "lengths")
+            with reading(folder / NPZ, "file of evaluations", cure):
+                found = _evaluations(
+                    {name: saved[key] for name, key in zip(names, needed, strict=True)}
+                )
+        texts = {
+            name: read_text(folder / name, "file of measurements", cure).replace("\r\n", "\n")
+            for name in files
+            if (folder / name).is_file()
+        }
+        return cls(address, record, **found, measured=texts)
+
+    @classmethod
+    def of_line(cls, line: bytes) -> Archived:
+        """Read what :meth:`line` wrote.
+
+        :raises Exception: of any kind, if it is damaged; call it within
+            :func:`~sb3_sparse.loading.guard.reading`
+        """
+        content = json.loads(line.decode())
+        if not isinstance(content, dict):
+            raise ValueError(f"it holds a {type(content).__name__}, not a mapping")
+        address, record, measured = (content[key] for key in ("address", "record", "measured"))
+        if not isinstance(address, str) or not address:
+            raise ValueError(f"its address is {address!r}")
+        if record["status"] not in STATUSES:
+            raise ValueError(f"its status is {record['status']!r}, not {' or '.join(STATUSES)}")
+        int(record.get("num_timesteps", 0)), dict(record.get("measured", {}))
+        if not all(isinstance(text, str) for text in measured.values()):
+            raise ValueError("measured must map names of files to their texts")
+        if content["evaluations"] is None:
+            if record["status"] == "finished":
+                raise ValueError("a finished run needs evaluations")
+            return cls(address, record, measured=measured)
+        return cls(address, record, **_evaluations(content["evaluations"]), measured=measured)
+
+    def line(self) -> bytes:
+        """The run as one line of JSON, with its end."""
+        parts = {"timesteps": self.timesteps, "returns": self.returns, "lengths": self.lengths}
+        content = {
+            "address": self.address,
+            "record": self.record,
+            "evaluations": {name: _short(part.tolist()) for name, part in parts.items()}
+            if len(self.timesteps)
+            else None,
+            "measured": self.measured,
+        }
+        return json.dumps(content, separators=(",", ":")).encode() + b"\n"
+
+    def covers(self, other: Archived) -> bool:
+        """Whether this is the same run, with all that was measured of the other."""
+        here, there = (dict(one.record.get("measured", {})) for one in (self, other))
+        return self.address == other.address and {**here, **there} == here
+
+
+class Archive:
+    """A file of lines. Processes may read it and append to it at once.
+
+    :param path: of the file; it need not exist yet
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def read(self) -> Lines:
+        """All lines, checked; a last one that was cut off while it was written is left out.
+
+        :raises ConfigError: if it cannot be opened
+        :raises CorruptStateError: if a line is damaged
+        """
+        with (
+            reading(self.path, "archive of runs", "study run --archive makes one"),
+            self.path.open("rb") as file,
+            _locked(file, alone=False),
+        ):
+            content = file.read()
+        whole, rest = self._parsed(content)
+        if rest:
+            warn(
+                f"the last line of {self.path} was cut off while it was written, and is left out; "
+                "study run --archive mends the file"
+            )
+        return whole
+
+    def add(self, runs: Iterable[Archived]) -> None:
+        """Append runs that it has not, each as a whole line that is on the disk afterwards.
+
+        What a killed process has left of a line is removed: its run's folder still has it all.
+
+        :raises CorruptStateError: if a line is damaged; then nothing is written
+        :raises Unwritable: if the file cannot be written; then it is as before
+        """
+        cure = "free space or make it writable, and give the command again; no run is lost"
+        with writing(self.path.parent, cure):
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            with self.path.open("a+b", buffering=0) as file, _locked(file, alone=True):
+                file.seek(0)
+                content = file.read()
+                known, rest = self._parsed(content)
+                text = b"".join(one.line() for one in runs if not _has(known, one))
+                whole = content.removesuffix(rest)
+                if text and whole and not whole.endswith(b"\n"):
+                    text = b"\n" + text
+                if text or rest:
+                    _write_at(file, len(whole), text)
+
+    def _parsed(self, content: bytes) -> tuple[Lines, bytes]:
+        """The lines by address, and what a killed process has left of another."""
+        *lines, rest = content.split(b"\n")
+        if rest and _is_whole(rest):
+            lines, rest = [*lines, rest], b""
+        if rest and not (rest.startswith(BEGINNING) or BEGINNING.startswith(rest)):
+            lines, rest = [*lines, rest], b""  # no line of ours: damaged
+        found: dict[str, list[Archived]] = {}
+        for number, line in enumerate(lines, start=1):
+            if line.strip():
+                with reading(Path(f"{self.path}, line {number}"), WHAT, CURE):
+                    one = Archived.of_line(line)
+                found.setdefault(one.address, []).append(one)
+        return found, rest
+
+
+def _write_at(file: IO[bytes], end: int, text: bytes) -> None:
+    """Put a text in place of all after an end, whole and on the disk, or not at all."""
+    left = memoryview(text)
+    try:
+        file.truncate(end)
+        while left:
+            left = left[file.write(left) :]
+        os.fsync(file.fileno())
+    except BaseException:
+        file.truncate(end)
+        raise
+
+
+def _has(known: Lines, run: Archived) -> bool:
+    return any(one.covers(run) for one in known.get(run.address, ()))
+
+
+def _is_whole(line: bytes) -> bool:
+    try:
+        json.loads(line)
+    except ValueError:
+        return False
+    return True
+
+
+def _evaluations(given: Mapping[str, Any]) -> dict[str, Array]:
+    """Arrays of numbers that suit one another.
+
+    :raises ValueError: if they do not
+    """
+    names = ("timesteps", "returns", "lengths")
+    found = {name: np.asarray(given[name], np.float64) for name in names}
+    timesteps, returns, lengths = found.values()
+    if returns.ndim != 2 or returns.size == 0 or timesteps.shape != returns.shape[:1]:
+        raise ValueError(f"returns of shape {returns.shape} at steps of shape {timesteps.shape}")
+    if lengths.shape != returns.shape:
+        raise ValueError(f"lengths of shape {lengths.shape}, returns of shape {returns.shape}")
+    if not all(np.isfinite(one).all() for one in found.values()):
+        raise ValueError("its evaluations are not finite")
+    return found
+
+
+def _short(value: Any) -> Any:
+    """Numbers as short as they can be written."""
+    if isinstance(value, list):
+        return [_short(one) for one in value]
+    return int(value) if value == int(value) else round(value, DECIMALS)
+
+
+@contextmanager
+def _locked(file: IO[bytes], alone: bool) -> Iterator[None]:
+    """Within it, no other process writes, nor, if alone, reads."""
+    if sys.platform == "win32":
+        import msvcrt
+
+        def hold(mode: int) -> None:
+            file.seek(2**31 - 2)  # a place that no line reaches: others could not read it
+            msvcrt.locking(file.fileno(), mode, 1)
+            file.seek(0)
+
+        hold(msvcrt.LK_LOCK)
+        try:
+            yield
+        finally:
+            hold(msvcrt.LK_UNLCK)
+        return
+    import fcntl
+
+    fcntl.flock(file, fcntl.LOCK_EX if alone else fcntl.LOCK_SH)
+    try:
+        yield
+    finally:
+        fcntl.flock(file, fcntl.LOCK_UN)
