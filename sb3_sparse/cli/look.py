@@ -63,7 +63,7 @@ def enjoy(
 def inspect(
     model: Annotated[Path, typer.Argument(help="A run's folder, or a model saved by SB3 (.zip).")],
 ) -> None:
-    """Print the layers of a saved sparse model, and how they are best computed on this machine."""
+    """Print the layers of a saved sparse model, and how each of them computes."""
     from sb3_sparse.zoo.inspect import inspect_model
 
     console.print(str(inspect_model(model)), soft_wrap=True)

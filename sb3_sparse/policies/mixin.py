@@ -216,6 +216,7 @@ class SparsePolicyMixin(BasePolicy):
         if not any(key.endswith(".weight_mask") for key in state_dict):
             for layer in self.sparse.layers:
                 layer.mask_targets()
+        self.sparse.choose_storage(self)  # of a policy that was pruned
         return incompatible
 
     def _check_masks(self, state_dict: Mapping[str, Any]) -> None:
@@ -228,7 +229,7 @@ class SparsePolicyMixin(BasePolicy):
     def get_extra_state(self) -> th.Tensor:
         """Mask seed, clock and number of mask updates of each network, and a 0; int64.
 
-        Files of version 0.1.0 may have a minibatch size at the end, which no longer means anything.
+        Older files may have a minibatch size in place of the 0, which no longer means anything.
         """
         numbers = [self.sparse.seed]
         for network in self.sparse.networks:
@@ -250,7 +251,7 @@ class SparsePolicyMixin(BasePolicy):
         ):
             raise CorruptStateError(
                 f"the saved sparsity state must be {expected} numbers, 0 or more (seed, clock and "
-                f"updates of {', '.join(n.name for n in networks)}, batch), got {state!r}; the "
+                f"updates of {', '.join(n.name for n in networks)}, and a 0), got {state!r}; the "
                 "file is damaged or belongs to a policy of another kind"
             )
         seed, *numbers, _ = state.tolist()

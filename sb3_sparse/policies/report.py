@@ -20,6 +20,24 @@ from sb3_sparse.policies.spec import NetworkSpec
 if TYPE_CHECKING:
     from sb3_sparse.policies.mixin import SparsePolicyMixin
 
+NON_ZEROS = "non-zeros"
+MASKED = "masked"
+DENSE = "dense"
+COMPUTES = (NON_ZEROS, MASKED, DENSE)
+"""How a layer may compute."""
+
+
+def compute_of(compact: bool, nnz: int, size: int) -> str:
+    """How a layer computes: :data:`NON_ZEROS`, :data:`MASKED` or :data:`DENSE`.
+
+    :param compact: whether it stores its active connections only
+    :param nnz: active connections
+    :param size: connections of the dense layer
+    """
+    if compact:
+        return NON_ZEROS
+    return MASKED if nnz < size else DENSE
+
 
 @dataclass(frozen=True)
 class LayerReport:
@@ -33,6 +51,8 @@ class LayerReport:
     :param flops: of one forward pass at batch 1: multiply-adds count 2, biases and activations 1
     :param dense_flops: the same for the dense layer; 0: not known, and neither are ``flops``
     :param in_budget: False for a layer left dense by ``dense_layers``
+    :param compute: how it computes: ``"non-zeros"``: with its active connections only;
+        ``"masked"``: with a dense weight that is 0 where inactive; ``"dense"``: all are active
     """
 
     network: str
@@ -43,6 +63,7 @@ class LayerReport:
     flops: int
     dense_flops: int
     in_budget: bool
+    compute: str
 
     @property
     def size(self) -> int:
@@ -78,7 +99,7 @@ class SparsityReport:
         return sum(r.parameters for r in self.layers)
 
     def __str__(self) -> str:
-        head = ("layer", "shape", "nnz", "density", "FLOPs", "of dense")
+        head = ("layer", "shape", "nnz", "density", "FLOPs", "of dense", "compute")
         rows = [
             (
                 r.name,
@@ -86,6 +107,7 @@ class SparsityReport:
                 f"{r.nnz:,}",
                 f"{r.density:.4f}" if r.in_budget else "dense",
                 *_costs(r.flops, r.dense_flops),
+                r.compute,
             )
             for r in self.layers
         ]
@@ -93,7 +115,7 @@ class SparsityReport:
         size = sum(r.size for r in self.layers)
         known = all(r.dense_flops for r in self.layers)
         total = ("total", "", f"{self.nnz:,}", f"{self.nnz / size:.4f}")
-        rows.append((*total, *_costs(flops, dense if known else 0)))
+        rows.append((*total, *_costs(flops, dense if known else 0), ""))
         widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
         lines = [
             "  ".join(
@@ -125,6 +147,7 @@ def report_on(policy: SparsePolicyMixin) -> SparsityReport:
     layers = []
     counted: set[int] = set()
     for network in policy.sparse.networks:
+        compact = {layer.name for layer in network.layers if layer.compact}
         kernels: list[tuple[str, Kernel, tuple[int, ...], int, bool]] = [
             (layer.name, layer.module, layer.shape, layer.nnz, True) for layer in network.layers
         ]
@@ -147,6 +170,7 @@ def report_on(policy: SparsePolicyMixin) -> SparsityReport:
                     flops=places * (2 * nnz + biases + units),
                     dense_flops=places * (2 * math.prod(shape) + biases + units),
                     in_budget=in_budget,
+                    compute=compute_of(name in compact, nnz, math.prod(shape)),
                 )
             )
     return SparsityReport((*layers, *_other_matrices(policy, counted)))
@@ -175,7 +199,15 @@ def _other_matrices(policy: SparsePolicyMixin, counted: set[int]) -> list[LayerR
         size = parameter.numel()
         found.append(
             LayerReport(
-                (within or list(specs))[0], name, tuple(parameter.shape), size, size, 0, 0, False
+                network=(within or list(specs))[0],
+                name=name,
+                shape=tuple(parameter.shape),
+                nnz=size,
+                parameters=size,
+                flops=0,
+                dense_flops=0,
+                in_budget=False,
+                compute=DENSE,
             )
         )
     return found

@@ -16,8 +16,7 @@ from sb3_sparse.zoo.run import Run
 from sb3_sparse.zoo.settings import method_of, policy_kwargs_of
 
 DEFAULT_TRIALS = 100
-# What tuning itself chose, and what the config's file had: that is compared as settings.
-NOT_COMPARED = ("compute", "run.entry")
+NOT_COMPARED = ("run.entry",)  # what the config's file had: that is compared as settings
 
 
 @dataclass(frozen=True)
@@ -29,7 +28,6 @@ class Definition:
     :param seeds: runs a trial
     :param sampler: ``"grid"``, ``"tpe"`` or ``"random"``
     :param pruner: ``"none"``, ``"median"``, ``"halving"`` or ``"hyperband"``
-    :param compute: how trials store layers, in studies of version 0.1.0; None: as the run says
     :raises ConfigError: if these do not go together
     """
 
@@ -38,20 +36,12 @@ class Definition:
     seeds: int
     sampler: str
     pruner: str
-    compute: str | None = None
 
     def __post_init__(self) -> None:
         check_seeds(self.seeds)
         check_space(self.space, self.run)
         self.make_sampler()
         self.make_pruner()
-
-    @property
-    def trained(self) -> Run:
-        """The run as trials train it, but for the sampled values."""
-        return (
-            self.run if self.compute is None else with_values(self.run, {"compute": self.compute})
-        )
 
     @property
     def method(self) -> str:
@@ -110,7 +100,6 @@ class Definition:
             "seeds": self.seeds,
             "sampler": self.sampler,
             "pruner": self.pruner,
-            "compute": self.compute,
             "settings": with_values(self.run, one_of_each(self.space)).settings(),
             "evaluation": self.run.evaluation(),
         }
@@ -120,7 +109,7 @@ class Definition:
         """What :meth:`as_dict` described."""
         space = Space.from_dict(values["space"])
         run = Run(**values["run"])
-        how = (values[name] for name in ("seeds", "sampler", "pruner", "compute"))
+        how = (values[name] for name in ("seeds", "sampler", "pruner"))
         return Definition(run, space, *how)
 
 

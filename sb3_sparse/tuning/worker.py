@@ -47,7 +47,7 @@ def work(
     study = find_study(opened, name, f"{shown_url(storage)} of {node()}")
     definition = definition_of(study)
     study.sampler, study.pruner = definition.make_sampler(), definition.make_pruner()
-    objective = Objective(definition.trained, definition.space, definition.seeds, trials)
+    objective = Objective(definition.run, definition.space, definition.seeds, trials)
     again = retry_with(forget)
     counts, in_a_row = {"trained": 0, "failed": 0}, 0
     while True:

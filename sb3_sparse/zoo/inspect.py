@@ -2,65 +2,109 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from sb3_sparse.engine.auto import choose
 from sb3_sparse.loading.zips import check_state, look_into
-from sb3_sparse.policies.report import SparsityReport
+from sb3_sparse.policies.report import NON_ZEROS, SparsityReport
+from sb3_sparse.policies.storage import KNOWN
+from sb3_sparse.zoo.computing import Computing, computing_in, layers_in
 from sb3_sparse.zoo.folder import arguments_of, is_run, model_in, zip_path
-from sb3_sparse.zoo.outline import outline_of
+from sb3_sparse.zoo.outline import Outline, outline_of
 from sb3_sparse.zoo.positions import image_in
+from sb3_sparse.zoo.record import NAME, read_record
 
 
 @dataclass(frozen=True)
 class Inspection:
     """What a saved model is.
 
-    :param report: its layers
-    :param compact: names of the layers that ``compute="auto"`` lets compute on their non-zeros here
+    :param report: its layers. How each of them computes is that of the run where the run's record
+        says it, else as the model was made, on this machine's processor
     :param compute: what it was made with
+    :param computing: what the run's record says of how it computed; None: nothing, or no record
     """
 
     report: SparsityReport
-    compact: tuple[str, ...]
     compute: str
+    computing: Computing | None = None
 
     def __str__(self) -> str:
-        parts = [str(self.report), ""]
+        return "\n".join([str(self.report), "", *self._remarks()])
+
+    def _remarks(self) -> list[str]:
+        if self.computing is not None:
+            sittings = [f"Trained {sitting}." for sitting in self.computing.sittings]
+            return [f"The run asked for compute={self.computing.asked!r}.", *sittings]
+        compact = sum(layer.compute == NON_ZEROS for layer in self.report.layers)
         if self.compute != "auto":
-            parts.append(f"The model was made with compute={self.compute!r}.")
-        elif self.compact:
-            parts.append(f"compute='auto' computes on non-zeros here: {', '.join(self.compact)}")
-        else:
-            parts.append("compute='auto' keeps masks: no linear layer is large and sparse enough")
-        return "\n".join(parts)
+            return [f"The model was made with compute={self.compute!r}."]
+        if compact:
+            of = len(self.report.layers)
+            return [f"compute='auto': {compact} of {of} layers compute on non-zeros here"]
+        return ["compute='auto' keeps masks: no linear layer is large and sparse enough"]
 
 
 def inspect_model(path: Path) -> Inspection:
-    """The sparsity report of a saved model, and how its layers are computed here.
+    """The sparsity report of a saved model, and how its layers compute.
 
     Nothing is unpickled and no class that the file names is imported, so that a stranger's file can
     be looked into.
 
     :param path: a run's folder, or a zip that SB3 saved, whichever algorithm trained it
     :raises ConfigError: if there is no such file, or no sparse policy in it
-    :raises CorruptStateError: if the file is damaged
+    :raises CorruptStateError: if the file is damaged, or the run's record
     :raises Diverged: if the network is not finite
     """
     path = path if is_run(path) else zip_path(path)  # a run has a folder of its environment's name
+    folder = path if path.is_dir() else path.parent
     if path.is_dir():
-        path = model_in(path, arguments_of(path)["env"], False)
+        path = model_in(folder, arguments_of(folder)["env"], False)
+    computing, recorded = None, {}
+    if is_run(folder) and (folder / NAME).is_file():  # rl-zoo's own runs have no record
+        record = read_record(folder)
+        computing, recorded = computing_in(record, folder), layers_in(record, folder)
     contents = look_into(path)
     check_state(contents.state, str(path))
-    data = contents.data
-    image = image_in(data.get("observation_space"))
-    outline = outline_of(contents.state, image, str(path))
-    kwargs = data.get("policy_kwargs")
-    compute = kwargs.get("compute", "auto") if isinstance(kwargs, dict) else "auto"
-    names = {layer.name for layer in outline.layers}
-    return Inspection(
-        report=outline.report,
-        compact=tuple(choose(outline.root, outline.layers, names)),
-        compute=str(compute),
+    outline = outline_of(
+        contents.state, image_in(contents.data.get("observation_space")), str(path)
     )
+    kwargs = contents.data.get("policy_kwargs")
+    kwargs = kwargs if isinstance(kwargs, dict) else {}
+    compute = str(kwargs.get("compute", "auto"))
+    compact = _compact(compute, outline, contents.data.get("policy_class"), kwargs)
+    layers = (
+        replace(layer, compute=NON_ZEROS) if layer.name in compact else layer
+        for layer in outline.report.layers
+    )
+    told = (replace(one, compute=recorded.get((one.name, one.nnz), one.compute)) for one in layers)
+    return Inspection(SparsityReport(tuple(told)), compute, computing)
+
+
+def _compact(
+    compute: str, outline: Outline, policy_class: object, kwargs: Mapping[str, Any]
+) -> set[str]:
+    """Names of the layers that compute on their non-zeros when the model is loaded.
+
+    :param policy_class: what the file says of it
+    :param kwargs: the policy's arguments
+    """
+    names = {layer.name for layer in outline.layers}
+    if compute == "sparse":
+        return {layer.name for layer in outline.layers if len(layer.shape) == 2}
+    if compute != "auto" or not _known(policy_class):
+        return set()
+    if not _known(kwargs.get("features_extractor_class")):
+        names = {name for name in names if "features_extractor." not in name}
+    return set(choose(outline.root, outline.layers, names))
+
+
+def _known(written: object) -> bool:
+    """Whether a class, as a file writes it, is one that only calls its layers; None: the usual."""
+    module = written.get("__module__") if isinstance(written, dict) else written
+    if not isinstance(module, str):
+        return True
+    return module.removeprefix("<class '").partition(".")[0] in KNOWN

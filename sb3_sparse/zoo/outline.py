@@ -16,7 +16,7 @@ from sb3_sparse.engine.masked import MaskedLayer
 from sb3_sparse.errors import ConfigError, CorruptStateError
 from sb3_sparse.policies.aliases import SparsePolicy, supported_algorithms
 from sb3_sparse.policies.compiled import plain_names
-from sb3_sparse.policies.report import LayerReport, SparsityReport
+from sb3_sparse.policies.report import LayerReport, SparsityReport, compute_of
 from sb3_sparse.policies.spec import NetworkSpec
 from sb3_sparse.zoo.positions import positions_of
 
@@ -32,7 +32,8 @@ IMPALA_BLOCK = ".layers."
 class Outline:
     """What a state_dict tells of a policy.
 
-    :param report: its layers; FLOPs of a convolution are 0 where its strides are not known
+    :param report: its layers, all of them dense or masked, as a state_dict stores them; FLOPs of a
+        convolution are 0 where its strides are not known
     :param root: modules of the same names and shapes, with activations between
     :param layers: those within the budget
     """
@@ -90,6 +91,7 @@ def outline_of(state: Mapping[str, Any], image: tuple[int, ...] | None, where: s
                 flops=places * (2 * nnz + biases + units),
                 dense_flops=places * (2 * weight.numel() + biases + units),
                 in_budget=mask is not None,
+                compute=compute_of(False, nnz, weight.numel()),
             )
         )
     _fill(root)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 from statistics import fmean
 
@@ -65,7 +66,8 @@ class EpisodesProgress:
 
 
 class TrainingProgress(Watch):
-    """A line for each evaluation, and a bar with the return of the last episodes and the sparsity.
+    """A line for each evaluation, and a bar with the return of the last episodes, the sparsity and
+    what a second of training was good for in environment steps, evaluations included.
 
     On something that is no terminal, a line every tenth of the run in place of the bar.
 
@@ -105,7 +107,7 @@ class TrainingProgress(Watch):
     def _on_training_start(self) -> None:
         self.planned = self.model._total_timesteps
         self.printed = 0
-        policy = self.model.policy
+        policy = unwrapped(self.model.policy)
         if isinstance(policy, SparsePolicyMixin):
             compact = [layer.compact for layer in policy.sparse.layers]
             if any(compact):
@@ -119,7 +121,9 @@ class TrainingProgress(Watch):
         policy = unwrapped(self.model.policy)
         if isinstance(policy, SparsePolicyMixin):
             text += f", sparsity {policy.sparse.sparsity:.2%}"
-        return text
+        seconds = (time.time_ns() - self.model.start_time) / 1e9  # as SB3's own time/fps
+        done = self.model.num_timesteps - self.model._num_timesteps_at_start
+        return f"{text}, {done / seconds:.0f} steps a second" if done else text
 
     def _on_step(self) -> bool:
         done = min(self.num_timesteps, self.planned)

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
@@ -23,6 +24,7 @@ from sb3_sparse.zoo.checkpoint import (
     locked,
     restored_monitors,
 )
+from sb3_sparse.zoo.computing import computing_at
 from sb3_sparse.zoo.disk import writing
 from sb3_sparse.zoo.divergence import check_networks
 from sb3_sparse.zoo.ending import diverging, recorded
@@ -183,7 +185,9 @@ def _learn(
         evaluation.restore(start)
     done, planned = model.num_timesteps, experiment.n_timesteps
     status = "running" if done < planned else "evaluating"
-    state = {"device": str(model.device), "error": None}
+    state: dict[str, Any] = {"device": str(model.device), "error": None}
+    if status == "running":
+        state["computing"] = computing_at(policy, done, read_record(folder), folder)
     write_record(folder, status=status, num_timesteps=done, **state, **sparsity_of(policy))
     try:
         if done < planned:

@@ -12,10 +12,13 @@ from pathlib import Path
 
 import pytest
 import torch as th
+from stable_baselines3 import SAC
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from support import ALGORITHMS, make
+from torch import nn
 
-from sb3_sparse import cli
+from sb3_sparse import SparseSACPolicy, cli
 from sb3_sparse.errors import ConfigError, CorruptStateError
 from sb3_sparse.loading.zooyaml import NotBuilt, read_zoo_yaml
 from sb3_sparse.zoo.finetune import check_wrappers
@@ -167,6 +170,32 @@ def test_what_is_told_by_names_and_shapes_is_the_policys_own_report(
     found = inspect_model(tmp_path / "model.zip")
     assert found.report == model.policy.sparsity_report()
     assert found.compute == kwargs.get("compute", "auto")
+
+
+class Own(BaseFeaturesExtractor):
+    """An extractor of the user's, of which nobody knows what it does with its layers."""
+
+    def __init__(self, space):
+        super().__init__(space, 200)
+        self.layers = nn.Sequential(nn.Linear(space.shape[0], 200), nn.ReLU(), nn.Linear(200, 200))
+
+    def forward(self, x):
+        return self.layers(x)
+
+
+class OwnPolicy(SparseSACPolicy):
+    """The same of a policy."""
+
+
+@pytest.mark.parametrize("policy", ["SparsePolicy", OwnPolicy])
+def test_layers_in_modules_of_the_users_are_told_as_the_policy_has_them(policy, tmp_path):
+    kwargs = dict(sparsity=0.9, net_arch=[200, 200], features_extractor_class=Own)
+    model = SAC(policy, "Pendulum-v1", policy_kwargs=kwargs, buffer_size=10, device="cpu")
+    model.save(tmp_path / "model.zip")
+    own = {r.name: r.compute for r in model.policy.sparsity_report().layers}
+    found = inspect_model(tmp_path / "model.zip").report.layers
+    assert {r.name: r.compute for r in found} == own
+    assert ("non-zeros" in own.values()) == (policy == "SparsePolicy")
 
 
 def test_convolutions_of_unknown_strides_have_no_flops_but_all_else(tmp_path):

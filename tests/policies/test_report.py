@@ -67,6 +67,32 @@ def test_the_table_names_every_layer_and_the_totals():
     assert f"parameters: {report.parameters:,}" in table
 
 
+@pytest.mark.parametrize(
+    ("compute", "inner", "full"),
+    [
+        ("auto", "non-zeros", "dense"),
+        ("sparse",) + 2 * ("non-zeros",),
+        ("masked", "masked", "dense"),
+    ],
+)
+def test_every_row_says_how_the_layer_computes(compute, inner, full):
+    kwargs = dict(net_arch=[200, 200], compute=compute, dense_layers=["actor.latent_pi.0"])
+    report = make("SAC", policy_kwargs=kwargs).policy.sparsity_report()
+    rows = {row.name: row for row in report.layers}
+    assert rows["actor.latent_pi.0"].compute == "dense"  # no sparse layer, so never on non-zeros
+    assert rows["actor.latent_pi.2"].compute == rows["critic.qf1.2"].compute == inner
+    assert rows["actor.mu"].density == 1.0  # within the budget, which gives it all 200
+    assert rows["actor.mu"].compute == full
+    lines = {line.split()[0]: line.split()[-1] for line in str(report).splitlines() if line}
+    assert lines["layer"] == "compute"
+    assert {name: lines[name] for name in rows} == {n: row.compute for n, row in rows.items()}
+
+
+def test_a_policy_without_zeros_is_dense():
+    report = make("PPO", policy_kwargs=dict(sparsity=0.0)).policy.sparsity_report()
+    assert {row.compute for row in report.layers} == {"dense"}
+
+
 def test_a_report_leaves_the_policy_as_it_was():
     model = make("DQN", gym.make("TinyImages-v0"))
     model.policy.set_training_mode(True)

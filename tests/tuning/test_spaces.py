@@ -45,7 +45,7 @@ def test_the_papers_grid_has_what_the_method_has(method, grid, cells):
     assert space.grid == grid
     if method == LeastIndex.name:
         return  # no config is shipped for it
-    definition = Definition(small_run(method=method), space, 1, "grid", "none", None)
+    definition = Definition(small_run(method=method), space, 1, "grid", "none")
     assert definition.trials(None) == cells
 
 
@@ -195,7 +195,7 @@ def test_a_file_that_is_not_there(name):
 
 
 def definition(space=None, **changes):
-    values = dict(seeds=1, sampler="grid", pruner="none", compute=None)
+    values = dict(seeds=1, sampler="grid", pruner="none")
     return Definition(small_run(), space or paper_space("rigl"), **{**values, **changes})
 
 

@@ -1,0 +1,124 @@
+"""How a run computes, as its record says: what was asked for, what came of it, and on what.
+
+Equal seeds give equal runs where all of this is equal: instruction sets and threads decide in
+which order numbers are added, and so how they are rounded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch as th
+
+from sb3_sparse.engine.native.library import in_use, why_missing
+from sb3_sparse.errors import CorruptStateError
+from sb3_sparse.loading.guard import reading
+from sb3_sparse.policies.mixin import SparsePolicyMixin
+from sb3_sparse.policies.report import COMPUTES, NON_ZEROS
+from sb3_sparse.zoo.record import CURE, NAME, WHAT
+
+
+@dataclass(frozen=True)
+class Sitting:
+    """A stretch of training in one process.
+
+    :param num_timesteps: environment steps when it began
+    :param instructions: instruction set of the kernels; None: they are not compiled
+    :param torch_instructions: instruction set of torch's own kernels
+    :param threads: of torch, and so of the kernels
+    :param layers: how each layer computed when it began, by name
+    """
+
+    num_timesteps: int
+    instructions: str | None
+    torch_instructions: str
+    threads: int
+    layers: Mapping[str, str]
+
+    def __str__(self) -> str:
+        compact = sum(how == NON_ZEROS for how in self.layers.values())
+        kernels = "no kernels" if self.instructions is None else f"{self.instructions} kernels"
+        return (
+            f"from step {self.num_timesteps}: {compact} of {len(self.layers)} layers on non-zeros, "
+            f"{kernels}, torch's {self.torch_instructions}, {self.threads} thread(s)"
+        )
+
+
+@dataclass(frozen=True)
+class Computing:
+    """How a run computes.
+
+    :param asked: ``compute`` of the policy
+    :param sittings: stretches of training, one after the other
+    """
+
+    asked: str
+    sittings: tuple[Sitting, ...]
+
+
+def computing_at(
+    policy: SparsePolicyMixin, num_timesteps: int, record: Mapping[str, Any], folder: Path
+) -> dict[str, Any]:
+    """What a run's record shall say of how it computes, when a sitting begins.
+
+    A sitting that began at this step or later is not part of the run: it was killed before its
+    first checkpoint.
+
+    :param num_timesteps: environment steps that are done
+    :param record: what the run's record says so far
+    :param folder: of the run
+    """
+    known = computing_in(record, folder)
+    now = Sitting(
+        num_timesteps,
+        None if why_missing() else in_use(),
+        th.backends.cpu.get_cpu_capability(),
+        th.get_num_threads(),
+        {layer.name: layer.compute for layer in policy.sparsity_report().layers},
+    )
+    before = () if known is None else known.sittings
+    earlier = [one for one in before if one.num_timesteps < num_timesteps]
+    return asdict(Computing(policy.sparsity_config.compute, (*earlier, now)))
+
+
+def computing_in(record: Mapping[str, Any], folder: Path) -> Computing | None:
+    """What a run's record says of how it computes; None in records of older versions.
+
+    :param folder: of the run
+    :raises CorruptStateError: if it is damaged
+    """
+    if "computing" not in record:
+        return None
+    with reading(folder / NAME, WHAT, CURE):
+        found = record["computing"]
+        sittings = tuple(Sitting(**one) for one in found["sittings"])
+        for one in sittings:
+            _check(one.layers)
+            if type(one.num_timesteps) is not int:
+                raise CorruptStateError(f"a sitting began at step {one.num_timesteps!r}")
+        return Computing(str(found["asked"]), sittings)
+
+
+def layers_in(record: Mapping[str, Any], folder: Path) -> dict[tuple[str, int], str]:
+    """How each layer of a run computes, or did when it was last saved, by name and nnz.
+
+    :param folder: of the run
+    :return: empty in records of older versions
+    :raises CorruptStateError: if it is damaged
+    """
+    with reading(folder / NAME, WHAT, CURE):
+        layers = [one for one in record.get("layers", []) if "compute" in one]
+        found = {(str(one["name"]), int(one["nnz"])): one["compute"] for one in layers}
+        _check({name: how for (name, _), how in found.items()})
+    return found
+
+
+def _check(layers: Mapping[str, Any]) -> None:
+    for name, how in layers.items():
+        if how not in COMPUTES:
+            raise CorruptStateError(
+                f"{name} computes {how!r}, which is none of {', '.join(COMPUTES)}; {CURE}"
+            )

@@ -1,0 +1,142 @@
+"""What a run's record says of how the run computes."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import signal
+from pathlib import Path
+
+import pytest
+import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_sparse.engine.native import library
+from sb3_sparse.errors import CorruptStateError
+from sb3_sparse.zoo.computing import Computing, Sitting, computing_at, computing_in
+from sb3_sparse.zoo.inspect import inspect_model
+from sb3_sparse.zoo.record import read_record, write_record
+from sb3_sparse.zoo.run import Run
+from sb3_sparse.zoo.train import resume, train
+
+LARGE = {"net_arch": [200, 200], "batch_size": 16, "learning_starts": 50, "update_interval": 20}
+QUICK = dict(eval_freq=200, eval_episodes=1)
+NAMES = ["q_net.q_net.0", "q_net.q_net.2", "q_net.q_net.4"]
+"""4-200-200-2: 40,000 connections in the middle, so one run of layers that may be compact."""
+
+
+class CtrlC(BaseCallback):
+    """What a user does after 900 steps."""
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps == 900:
+            signal.raise_signal(signal.SIGINT)
+        return True
+
+
+def run(method: str = "rigl", steps: int = 300, **hyperparams) -> Run:
+    return Run(method=method, n_timesteps=steps, hyperparams={**LARGE, **hyperparams}, **QUICK)
+
+
+def layers_of(folder: Path) -> dict[str, str]:
+    return {layer["name"]: layer["compute"] for layer in read_record(folder)["layers"]}
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory) -> Path:
+    return train(run(), tmp_path_factory.mktemp("logs")).folder
+
+
+def test_the_record_says_what_was_asked_for_and_what_decides_rounding(trained):
+    found = computing_in(read_record(trained), trained)
+    compact = dict.fromkeys(NAMES, "non-zeros")
+    capability = th.backends.cpu.get_cpu_capability()
+    sitting = Sitting(0, library.in_use(), capability, th.get_num_threads(), compact)
+    assert found == Computing("auto", (sitting,))
+    assert layers_of(trained) == compact
+
+
+def test_masks_that_are_asked_for_are_on_record(tmp_path):
+    folder = train(run(compute="masked"), tmp_path).folder
+    found = computing_in(read_record(folder), folder)
+    assert found.asked == "masked"
+    assert found.sittings[0].layers[NAMES[1]] == layers_of(folder)[NAMES[1]] == "masked"
+
+
+def test_pruning_changes_how_layers_compute_and_the_record_has_both(tmp_path):
+    pruned = run("prune", 600, update_interval=5)
+    folder = train(pruned, tmp_path).folder
+    (sitting,) = computing_in(read_record(folder), folder).sittings
+    assert sitting.layers == dict.fromkeys(NAMES, "dense")
+    assert layers_of(folder) == dict.fromkeys(NAMES, "non-zeros")
+    told = str(inspect_model(folder))
+    assert "Trained from step 0: 0 of 3 layers on non-zeros" in told
+
+
+def test_a_run_that_is_gone_on_with_has_a_sitting_more(tmp_path):
+    pruned = run("prune", 1000, update_interval=5)
+    stopped = train(pruned, tmp_path, [CtrlC()])
+    steps = read_record(stopped.folder)["num_timesteps"]
+    resume(stopped.folder)
+    first, second = computing_in(read_record(stopped.folder), stopped.folder).sittings
+    assert (first.num_timesteps, second.num_timesteps) == (0, steps)
+    assert first.layers == dict.fromkeys(NAMES, "dense")
+    assert second.layers == dict.fromkeys(NAMES, "non-zeros")  # before its first gradient step
+
+
+def test_sittings_that_came_to_nothing_are_forgotten(trained):
+    policy = train(run(), trained.parent.parent).model.policy
+    record = read_record(trained)
+    for steps in (200, 400, 200):
+        record["computing"] = computing_at(policy, steps, record, trained)
+    assert [one["num_timesteps"] for one in record["computing"]["sittings"]] == [0, 200]
+
+
+def test_inspect_tells_what_the_record_says_not_what_would_be_chosen_here(
+    trained, tmp_path, monkeypatch
+):
+    monkeypatch.setattr("sb3_sparse.zoo.inspect.choose", lambda *_: [])
+    for path in (trained, trained / "best_model.zip"):
+        found = inspect_model(path)
+        assert [layer.compute for layer in found.report.layers] == ["non-zeros"] * 3
+        assert "The run asked for compute='auto'." in str(found)
+        assert f"3 of 3 layers on non-zeros, {library.in_use()} kernels" in str(found)
+    shutil.copy(trained / "best_model.zip", tmp_path)
+    best = inspect_model(tmp_path / "best_model.zip")
+    assert best.computing is None
+    assert [layer.compute for layer in best.report.layers] == ["dense", "masked", "dense"]
+
+
+@pytest.fixture
+def record(trained):
+    """The record's file, which is put back in the end."""
+    path = trained / "sparsity.json"
+    before = path.read_text()
+    yield json.loads(before)
+    path.write_text(before)
+
+
+def test_records_of_older_versions_are_read(trained, record):
+    del record["computing"]
+    for layer in record["layers"]:
+        del layer["compute"]
+    (trained / "sparsity.json").write_text(json.dumps(record))
+    found = inspect_model(trained)
+    assert found.computing is None
+    assert "compute='auto': 3 of 3 layers compute on non-zeros here" in str(found)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        {"computing": 3},
+        {"computing": {"asked": "auto"}},
+        {"computing": {"asked": "auto", "sittings": [{"num_timesteps": 0}]}},
+        {"layers": [{"name": "q_net.q_net.0", "nnz": 80, "compute": "quickly"}]},
+        {"layers": 3},
+    ],
+)
+def test_a_damaged_record_is_named(trained, record, damage):
+    write_record(trained, **damage)
+    with pytest.raises(CorruptStateError, match=r"sparsity\.json"):
+        inspect_model(trained)
