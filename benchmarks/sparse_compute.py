@@ -236,7 +236,6 @@ def time_steps(
             return run
 
         trains = {name: timed(name, train) for name, (_, train, _) in variants.items()}
-        variants["auto"][1]()  # sees the batch size; the next one chooses
         times = interleaved(trains, rounds)
         rows = rows_of("step", f"{algo} {width}", ALGOS[algo][2], sparsity, times, steps)
         for row in rows:
