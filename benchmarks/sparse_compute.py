@@ -6,6 +6,7 @@ are what counts. Rows are appended to a CSV file as they come.
     python benchmarks/sparse_compute.py                     # layers, and steps 256 and 1024 wide
     python benchmarks/sparse_compute.py --steps --widths 256,512,1024,2048,4096   # hours
     python benchmarks/sparse_compute.py --steps --algos SAC --widths 256 --rounds 41
+    python benchmarks/sparse_compute.py --rule              # what the rule of "auto" loses
 """
 
 from __future__ import annotations
@@ -15,9 +16,10 @@ import copy
 import csv
 import gc
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import nullcontext
 from functools import partial
+from itertools import product
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -33,7 +35,7 @@ from torch.nn import functional
 
 from sb3_sparse.engine.chains import Chain
 from sb3_sparse.engine.linear import CompactLinear
-from sb3_sparse.engine.native.library import in_use
+from sb3_sparse.engine.native.library import in_use, instruction_sets, use
 from sb3_sparse.engine.products import TILE, tiles_of
 from sb3_sparse.engine.structure import Structure
 from sb3_sparse.sparsity.widths import equivalent_widths
@@ -245,6 +247,74 @@ def time_steps(
         gc.collect()
 
 
+# --- the rule of compute="auto" -----------------------------------------------------------------
+
+BEHIND = 0.05
+"""What auto may take longer than the better of masks and non-zeros, as a share of that."""
+
+
+def compact_layers(model: Any) -> list[str]:
+    layers = model.policy.sparsity_report().layers
+    return [layer.name for layer in layers if layer.compute == "non-zeros"]
+
+
+def time_rule(
+    algo: str, width: int, sparsity: float, activation: str, sets: list[str], rounds: int
+) -> Iterator[dict]:
+    """Gradient steps with masks, on non-zeros and by the rule, in each instruction set.
+
+    Where auto has the same layers on non-zeros as one of the other two, it is the same program, and
+    has that one's times.
+    """
+    steps = max(2, min(20, round(20 * (256 / width) ** 2)))
+    make = maker(algo, [width, width], steps)
+    kwargs = dict(sparsity=sparsity, activation_fn=getattr(th.nn, activation))
+    made = {
+        name: make("SparsePolicy", dict(kwargs, compute=compute))
+        for name, compute in (("masked", "masked"), ("non-zeros", "sparse"), ("auto", "auto"))
+    }
+    chosen = {name: compact_layers(model) for name, (model, _, _) in made.items()}
+    same = [name for name in ("masked", "non-zeros") if chosen[name] == chosen["auto"]]
+
+    def stepped(name: str, instructions: str) -> Callable[[], None]:
+        def run() -> None:
+            use(instructions)
+            made[name][1]()
+
+        return run
+
+    todo = {"masked": stepped("masked", sets[0])}  # no kernel of ours is in it
+    for name in ("non-zeros",) if same else ("non-zeros", "auto"):
+        todo |= {f"{name} {one}": stepped(name, one) for one in sets}
+    times = interleaved(todo, rounds)
+    for one in sets if same else ():
+        times[f"auto {one}"] = times["masked" if same[0] == "masked" else f"non-zeros {one}"]
+    yield from rows_of(
+        "rule", f"{algo} {width} {activation}", ALGOS[algo][2], sparsity, times, steps
+    )
+
+
+def print_rule(rows: Iterable[Mapping[str, Any]]) -> None:
+    """How far auto is behind the better of masks and non-zeros, and where by more than 5 %."""
+    cases: dict[tuple[str, str], dict[str, float]] = {}
+    for row in rows:
+        if row["what"] == "rule":
+            case = cases.setdefault((row["case"], f"{float(row['sparsity']):.0%}"), {})
+            case[row["variant"]] = float(row["speedup"])
+    shares = {}
+    for (case, sparsity), speedups in cases.items():
+        for variant in [name for name in speedups if name.startswith("auto ")]:
+            one = variant.removeprefix("auto ")
+            auto, compact = speedups[variant], speedups[f"non-zeros {one}"]
+            told = f"{case} {sparsity} {one}: auto {auto:.2f}x, non-zeros {compact:.2f}x of masked"
+            shares[told] = max(1.0, compact) / auto - 1
+    worst = sorted(shares, key=lambda told: -shares[told])
+    beyond = [told for told in worst if shares[told] > BEHIND]
+    print(f"{len(beyond)} of {len(shares)} cases in which auto is more than {BEHIND:.0%} behind")
+    for told in beyond:
+        print(f"  {told}: {shares[told]:.1%} behind")
+
+
 def table(path: Path) -> None:
     """Print what a CSV file holds as Markdown: one line a case, one column a variant."""
     with path.open(newline="") as file:
@@ -267,6 +337,8 @@ def table(path: Path) -> None:
             cells.append(" / ".join(f"{float(size):.3g}" for size in sizes if size))
             print("| " + " | ".join([*key, *cells]) + " |")
         print()
+    if any(row["what"] == "rule" for row in rows):
+        print_rule(rows)
 
 
 FIELDS = ["what", "case", "batch", "sparsity", "variant", "milliseconds", "speedup", "megabytes"]
@@ -277,8 +349,15 @@ def main() -> None:
     parser.add_argument("--layers", action="store_true", help="only layers")
     parser.add_argument("--steps", action="store_true", help="only gradient steps")
     parser.add_argument("--algos", type=listed(str), default=["SAC", "TD3", "DQN", "PPO"])
-    parser.add_argument("--widths", type=listed(int), default=[256, 1024])
-    parser.add_argument("--sparsities", type=listed(float), default=[0.8, 0.9, 0.95, 0.99])
+    parser.add_argument("--rule", action="store_true", help='only what the rule of "auto" loses')
+    parser.add_argument("--widths", type=listed(int))
+    parser.add_argument("--sparsities", type=listed(float))
+    parser.add_argument(
+        "--activations", type=listed(str), default=["ReLU", "Tanh"], help="of --rule"
+    )
+    parser.add_argument(
+        "--instructions", type=listed(str), help="of --rule; default: all there are"
+    )
     parser.add_argument("--rounds", type=int, default=9)
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--csv", type=Path, default=Path("sparse_compute.csv"))
@@ -287,13 +366,15 @@ def main() -> None:
     if args.table is not None:
         table(args.table)
         return
+    args.widths = args.widths or ([32, 64, 128, 256, 512, 1024] if args.rule else [256, 1024])
+    args.sparsities = args.sparsities or [*([0.5] if args.rule else []), 0.8, 0.9, 0.95, 0.99]
     th.set_num_threads(args.threads)
     bf16 = th.backends.mkldnn.is_available() and th.ops.mkldnn._is_mkldnn_bf16_supported()
     print(
         f"torch {th.__version__}, {args.threads} thread(s), {in_use()} kernels, "
         f"bf16 {'yes' if bf16 else 'no'}, median of {args.rounds} interleaved rounds\n"
     )
-    everything = not (args.layers or args.steps)
+    everything = not (args.layers or args.steps or args.rule)
     rows: list[Iterator[dict]] = []
     if args.layers or everything:
         rows.append(time_layers(args.widths, args.sparsities, args.rounds))
@@ -304,10 +385,19 @@ def main() -> None:
             for width in args.widths
             for algo in args.algos
         ]
+    if args.rule:
+        grid = product(args.widths, args.algos, args.sparsities, args.activations)
+        sets = args.instructions or instruction_sets()
+        rows += [
+            time_rule(algo, width, sparsity, activation, sets, args.rounds)
+            for width, algo, sparsity, activation in grid
+        ]
+    measured = []
     with appending(args.csv, FIELDS) as write:
         for part in rows:
             for row in part:
                 write(row)
+                measured.append(row)
                 print(
                     f"{row['what']:<5} {row['case']:<26} batch {row['batch']:>3}  "
                     f"{row['sparsity']:.0%}  {row['variant']:<20} {row['milliseconds']:9.3f} ms  "
@@ -315,6 +405,8 @@ def main() -> None:
                     + (f"  {row['megabytes']:8.2f} MB" if "megabytes" in row else ""),
                     flush=True,
                 )
+    if args.rule:
+        print_rule(measured)
 
 
 if __name__ == "__main__":
