@@ -41,9 +41,10 @@ class Sitting:
     def __str__(self) -> str:
         compact = sum(how == NON_ZEROS for how in self.layers.values())
         kernels = "no kernels" if self.instructions is None else f"{self.instructions} kernels"
+        threads = "1 thread" if self.threads == 1 else f"{self.threads} threads"
         return (
             f"from step {self.num_timesteps}: {compact} of {len(self.layers)} layers on non-zeros, "
-            f"{kernels}, torch's {self.torch_instructions}, {self.threads} thread(s)"
+            f"{kernels}, torch's {self.torch_instructions}, {threads}"
         )
 
 

@@ -101,6 +101,7 @@ def test_inspect_tells_what_the_record_says_not_what_would_be_chosen_here(
         assert [layer.compute for layer in found.report.layers] == ["non-zeros"] * 3
         assert "The run asked for compute='auto'." in str(found)
         assert f"3 of 3 layers on non-zeros, {library.in_use()} kernels" in str(found)
+        assert str(found).endswith(", 1 thread.")
     shutil.copy(trained / "best_model.zip", tmp_path)
     best = inspect_model(tmp_path / "best_model.zip")
     assert best.computing is None
