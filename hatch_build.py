@@ -13,6 +13,7 @@ import subprocess
 import sys
 import sysconfig
 import tempfile
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -56,17 +57,17 @@ def compile_kernels(source: Path, library: Path, extra: tuple[str, ...] = ()) ->
         variants.update(avx2=AVX2, avx512=AVX512)
     with tempfile.TemporaryDirectory(dir=library.parent) as folder:
         objects = []
-        for suffix, flags in variants.items():
-            objects.append(str(Path(folder, f"{suffix}.o")))
+        for (suffix, flags), name in product(variants.items(), ("kernels", "act")):
+            objects.append(str(Path(folder, f"{name}_{suffix}.o")))
             subprocess.run(
                 [*command, *FLAGS, *flags, *extra, f"-DSUFFIX={suffix}", "-c",
-                 str(source / "kernels.c"), "-o", objects[-1]],
+                 str(source / f"{name}.c"), "-o", objects[-1]],
                 check=True, capture_output=True, text=True,
             )  # fmt: skip
         made = Path(folder, library.name)
         subprocess.run(
             [*command, *FLAGS, *extra, "-shared", str(source / "dispatch.c"), *objects, "-o",
-             str(made), "-pthread"],
+             str(made), "-pthread", "-lm"],
             check=True, capture_output=True, text=True,
         )  # fmt: skip
         made.replace(library)  # at once: a running process keeps the old one

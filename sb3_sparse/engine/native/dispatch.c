@@ -1,6 +1,8 @@
 /* Chooses the kernels for the processor at run time. */
 #include "kernels.h"
 
+#include <pthread.h>
+#include <stdlib.h>
 #include <string.h>
 
 #if defined(__x86_64__)
@@ -13,10 +15,10 @@ typedef struct {
     const char *name;
     void (*forward)(const layer_t *, const batch_t *);
     int (*backward)(const layer_t *, const batch_t *);
-    void (*single)(const layer_t *, const float *, float *);
+    int (*act)(const step_t *, int64_t, int64_t, const float *, float *);
 } kernels_t;
 
-#define ENTRY(name, suffix) {name, NAMED(forward, suffix), NAMED(backward, suffix), NAMED(single, suffix)}
+#define ENTRY(name, suffix) {name, NAMED(forward, suffix), NAMED(backward, suffix), NAMED(act, suffix)}
 
 /* The best first. What is plain on aarch64 is NEON, which every such processor has. */
 static const kernels_t all[] = {
@@ -49,9 +51,29 @@ static int runs_here(const kernels_t *kernels) {
 #define EXPORT __attribute__((visibility("default")))
 
 /* Changes with every change of what Python hands over. */
-EXPORT int sb3_sparse_version(void) { return 1; }
+EXPORT int sb3_sparse_version(void) { return 2; }
 
 openmp_t sb3_sparse_openmp;
+
+static pthread_key_t at_exit;
+static pthread_once_t once = PTHREAD_ONCE_INIT;
+static void make_key(void) { pthread_key_create(&at_exit, free); }
+
+float *sb3_sparse_scratch(size_t size) {
+    static _Thread_local float *kept;
+    static _Thread_local size_t kept_size;
+#ifdef __SANITIZE_ADDRESS__
+    kept_size = 0;
+#endif
+    if (size > kept_size) {
+        free(kept);
+        kept = aligned_alloc(64, size);
+        kept_size = kept ? size : 0;
+        pthread_once(&once, make_key);
+        pthread_setspecific(at_exit, kept); /* freed with the thread */
+    }
+    return kept;
+}
 
 /* Share these threads from now on; without them there is one. */
 EXPORT void sb3_sparse_share_threads(void *parallel, void *thread, void *threads) {
@@ -89,15 +111,8 @@ EXPORT int sb3_sparse_backward(const layer_t *layers, const batch_t *batch) {
     return chosen->backward(layers, batch);
 }
 
-/* One input through a chain; `spare` has room for two of its widest outputs. */
-EXPORT void sb3_sparse_single(const layer_t *layers, int64_t count, const float *x, float *spare,
-                              float *y) {
-    int64_t widest = 0;
-    for (int64_t l = 0; l < count; l++)
-        if (layers[l].rows > widest) widest = layers[l].rows;
-    for (int64_t l = 0; l < count; l++) {
-        float *to = l == count - 1 ? y : spare + (l % 2) * widest;
-        chosen->single(layers + l, x, to);
-        x = to;
-    }
+/* 1 if a result holds a NaN, -1 if there is no memory for it, else 0. */
+EXPORT int sb3_sparse_act(const step_t *steps, int64_t count, int64_t batch, const float *x,
+                          float *y) {
+    return chosen->act(steps, count, batch, x, y);
 }

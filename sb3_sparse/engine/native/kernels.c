@@ -1,112 +1,6 @@
-#include "kernels.h"
+#include "vectors.h"
 
-#include <pthread.h>
 #include <stdlib.h>
-#include <string.h>
-
-#if defined(__AVX512F__)
-#include <immintrin.h>
-#define WIDTH 16
-#elif defined(__AVX2__)
-#include <immintrin.h>
-#define WIDTH 8
-#else
-#define WIDTH 4
-#endif
-
-#ifndef __has_builtin
-#define __has_builtin(x) 0
-#endif
-#if __has_builtin(__builtin_shufflevector)
-#define SHUFFLE(a, b, i, j, k, l) __builtin_shufflevector(a, b, i, j, k, l)
-#else
-#define SHUFFLE(a, b, i, j, k, l) __builtin_shuffle(a, b, (int32_t __attribute__((vector_size(16)))){i, j, k, l})
-#endif
-
-typedef float vec __attribute__((vector_size(WIDTH * 4)));
-typedef float loose __attribute__((vector_size(WIDTH * 4), aligned(4), may_alias));
-#define INLINE static inline __attribute__((always_inline))
-#define LOAD(p) ((vec) * (const loose *)(p))
-#define STORE(p, v) (*(loose *)(p) = (v))
-
-/* Comparisons are turned so that a NaN stays one. */
-INLINE vec positive(vec a) { return (vec)(~(a < 0) & (typeof(a < 0))a); }
-INLINE vec where_positive(vec a, vec y) { return (vec)(~(y <= 0) & (typeof(a < 0))a); }
-
-/* Sum of a vector's elements. */
-INLINE float total(vec a) {
-#if WIDTH == 16
-    return _mm512_reduce_add_ps((__m512)a);
-#else
-    float sum = 0;
-    for (int i = 0; i < WIDTH; i++) sum += a[i];
-    return sum;
-#endif
-}
-
-/* Sums of eight vectors, in out[0..7]: transposed by halves and added up. */
-INLINE void totals(const vec *a, float *out, int add) {
-#if WIDTH >= 8
-#if WIDTH == 16
-    __m512 p[4], q[2];
-    for (int i = 0; i < 4; i++) {
-        __m512 u = (__m512)a[2 * i], v = (__m512)a[2 * i + 1];
-        p[i] = _mm512_add_ps(_mm512_unpacklo_ps(u, v), _mm512_unpackhi_ps(u, v));
-    }
-    for (int i = 0; i < 2; i++) {
-        __m512d u = _mm512_castps_pd(p[2 * i]), v = _mm512_castps_pd(p[2 * i + 1]);
-        q[i] = _mm512_add_ps(_mm512_castpd_ps(_mm512_unpacklo_pd(u, v)),
-                             _mm512_castpd_ps(_mm512_unpackhi_pd(u, v)));
-    }
-    __m512 lanes = _mm512_add_ps(_mm512_shuffle_f32x4(q[0], q[1], 0x88),
-                                 _mm512_shuffle_f32x4(q[0], q[1], 0xdd));
-    lanes = _mm512_add_ps(lanes, _mm512_shuffle_f32x4(lanes, lanes, 0xb1));
-    __m256 sums = _mm512_castps512_ps256(_mm512_shuffle_f32x4(lanes, lanes, 0x08));
-#else
-    __m256 p = _mm256_hadd_ps(_mm256_hadd_ps((__m256)a[0], (__m256)a[1]),
-                              _mm256_hadd_ps((__m256)a[2], (__m256)a[3]));
-    __m256 q = _mm256_hadd_ps(_mm256_hadd_ps((__m256)a[4], (__m256)a[5]),
-                              _mm256_hadd_ps((__m256)a[6], (__m256)a[7]));
-    __m256 sums = _mm256_add_ps(_mm256_permute2f128_ps(p, q, 0x20),
-                                _mm256_permute2f128_ps(p, q, 0x31));
-#endif
-    if (add) sums = _mm256_add_ps(sums, _mm256_loadu_ps(out));
-    _mm256_storeu_ps(out, sums);
-#else
-    for (int i = 0; i < 8; i++) out[i] = (add ? out[i] : 0) + total(a[i]);
-#endif
-}
-
-/* y[row] = start[row] + sum of value * x[column], N vectors wide, U connections at once. */
-INLINE void gather_rows(int N, int U, int64_t rows, const int32_t *start, const int32_t *column,
-                        const float *value, const float *bias, const float *gate, int relu,
-                        const float *x, float *y) {
-    for (int64_t r = 0; r < rows; r++) {
-        vec sum[8];
-        for (int i = 0; i < N * U; i++) sum[i] = (vec){0};
-        if (bias)
-            for (int j = 0; j < N; j++) sum[j] = bias[r] + (vec){0};
-        int32_t k = start[r], end = start[r + 1];
-        for (; k + U <= end; k += U)
-            for (int u = 0; u < U; u++) {
-                const float *from = x + (int64_t)column[k + u] * TILE;
-                vec w = value[k + u] + (vec){0};
-                for (int j = 0; j < N; j++) sum[u * N + j] += w * LOAD(from + j * WIDTH);
-            }
-        for (; k < end; k++) {
-            const float *from = x + (int64_t)column[k] * TILE;
-            vec w = value[k] + (vec){0};
-            for (int j = 0; j < N; j++) sum[j] += w * LOAD(from + j * WIDTH);
-        }
-        for (int i = N; i < N * U; i++) sum[i % N] += sum[i];
-        for (int j = 0; j < N; j++) {
-            vec s = sum[j];
-            if (relu) s = positive(s);
-            if (gate) s = where_positive(s, LOAD(gate + r * TILE + j * WIDTH));
-            STORE(y + r * TILE + j * WIDTH, s);
-        }
-    }
-}
 
 /* The same for `vectors` vectors of a tile. */
 static void gather(int64_t vectors, int64_t rows, const int32_t *start, const int32_t *column,
@@ -117,7 +11,7 @@ static void gather(int64_t vectors, int64_t rows, const int32_t *start, const in
         const float *g = gate ? gate + at : 0;
 #define STEP(N, U)                                                                        \
     {                                                                                     \
-        gather_rows(N, U, rows, start, column, value, bias, g, relu, x + at, y + at);     \
+        gather_rows(N, U, TILE, rows, start, column, value, bias, g, relu, x + at, y + at);     \
         j += N;                                                                           \
     }
         if (left >= 8)
@@ -177,45 +71,6 @@ static void sums(int64_t vectors, int64_t rows, const float *g, float *grad, int
     }
 }
 
-typedef float quad __attribute__((vector_size(16)));
-typedef float loose_quad __attribute__((vector_size(16), aligned(4), may_alias));
-
-/* A 4x4 block of `from` (rows `stride` apart) transposed into `to` (rows `step` apart). */
-INLINE void transpose(const float *from, int64_t stride, float *to, int64_t step) {
-    quad a = *(const loose_quad *)from, b = *(const loose_quad *)(from + stride);
-    quad c = *(const loose_quad *)(from + 2 * stride), d = *(const loose_quad *)(from + 3 * stride);
-    quad ab = SHUFFLE(a, b, 0, 4, 1, 5), cd = SHUFFLE(c, d, 0, 4, 1, 5);
-    *(loose_quad *)to = SHUFFLE(ab, cd, 0, 1, 4, 5);
-    *(loose_quad *)(to + step) = SHUFFLE(ab, cd, 2, 3, 6, 7);
-    ab = SHUFFLE(a, b, 2, 6, 3, 7), cd = SHUFFLE(c, d, 2, 6, 3, 7);
-    *(loose_quad *)(to + 2 * step) = SHUFFLE(ab, cd, 0, 1, 4, 5);
-    *(loose_quad *)(to + 3 * step) = SHUFFLE(ab, cd, 2, 3, 6, 7);
-}
-
-/* to[f, b] = from[b, f] for b < rows and f < columns. */
-static void transpose_all(const float *from, int64_t rows, int64_t columns, int64_t stride,
-                          float *to, int64_t step) {
-    int64_t whole_rows = rows / 4 * 4, whole_columns = columns / 4 * 4;
-    for (int64_t b = 0; b < whole_rows; b += 4)
-        for (int64_t f = 0; f < whole_columns; f += 4)
-            transpose(from + b * stride + f, stride, to + f * step + b, step);
-    for (int64_t f = 0; f < columns; f++)
-        for (int64_t b = f < whole_columns ? whole_rows : 0; b < rows; b++)
-            to[f * step + b] = from[b * stride + f];
-}
-
-/* [entries, features] to a tile; what fills it up to a whole vector is 0. */
-static void to_tile(const float *rows, int64_t entries, int64_t features, float *tile) {
-    transpose_all(rows, entries, features, features, tile, TILE);
-    int64_t padded = (entries + WIDTH - 1) / WIDTH * WIDTH;
-    for (int64_t f = 0; f < features && padded > entries; f++)
-        memset(tile + f * TILE + entries, 0, (padded - entries) * sizeof *tile);
-}
-
-static void from_tile(const float *tile, int64_t entries, int64_t features, float *rows) {
-    transpose_all(tile, features, entries, TILE, rows, features);
-}
-
 /* One thread's share of a batch: the tiles [first, last). */
 typedef struct {
     const layer_t *layers;
@@ -242,7 +97,7 @@ static void forward_share(share_t *share) {
         int64_t entries = entries_of(batch, t), vectors = vectors_of(batch, t);
         float *x = batch->input + t * layers->columns * TILE;
         if (batch->rows_in)
-            to_tile(batch->rows_in + t * TILE * layers->columns, entries, layers->columns, x);
+            to_tile(batch->rows_in + t * TILE * layers->columns, entries, layers->columns, TILE, x);
         for (const layer_t *layer = layers; layer <= last; layer++) {
             float *y = layer->output + t * layer->rows * TILE;
             gather(vectors, layer->rows, layer->row_start, layer->column, layer->value,
@@ -250,7 +105,7 @@ static void forward_share(share_t *share) {
             x = y;
         }
         if (batch->rows_out)
-            from_tile(x, entries, last->rows, batch->rows_out + t * TILE * last->rows);
+            from_tile(x, entries, last->rows, TILE, batch->rows_out + t * TILE * last->rows);
     }
 }
 
@@ -265,7 +120,8 @@ static void backward_share(share_t *share) {
         float *to = share->scratch[0] + (t - first) * size;
         const float *from = to, *y = top->output + t * size;
         if (batch->rows_grad)
-            to_tile(batch->rows_grad + t * TILE * top->rows, entries_of(batch, t), top->rows, to);
+            to_tile(batch->rows_grad + t * TILE * top->rows, entries_of(batch, t), top->rows, TILE,
+                    to);
         else
             from = batch->tiles_grad + t * size;
         for (int64_t r = 0; r < size && top->relu; r += TILE)
@@ -298,7 +154,7 @@ static void backward_share(share_t *share) {
     }
     for (int64_t t = first; t < last && batch->rows_input_grad; t++)
         from_tile(g + (t - first) * layers->columns * TILE, entries_of(batch, t), layers->columns,
-                  batch->rows_input_grad + t * TILE * layers->columns);
+                  TILE, batch->rows_input_grad + t * TILE * layers->columns);
 }
 
 typedef struct {
@@ -337,28 +193,6 @@ void NAMED(forward, SUFFIX)(const layer_t *layers, const batch_t *batch) {
     run(forward_share, shares, split(layers, batch, shares));
 }
 
-static pthread_key_t at_exit;
-static pthread_once_t once = PTHREAD_ONCE_INIT;
-static void make_key(void) { pthread_key_create(&at_exit, free); }
-
-/* Memory of this thread that stays for the next call: new pages cost as much as the products.
-   The address sanitizer gets exact sizes instead. */
-static float *scratch_of(size_t size) {
-    static _Thread_local float *kept;
-    static _Thread_local size_t kept_size;
-#ifdef __SANITIZE_ADDRESS__
-    kept_size = 0;
-#endif
-    if (size > kept_size) {
-        free(kept);
-        kept = aligned_alloc(64, size);
-        kept_size = kept ? size : 0;
-        pthread_once(&once, make_key);
-        pthread_setspecific(at_exit, kept); /* freed with the thread */
-    }
-    return kept;
-}
-
 int NAMED(backward, SUFFIX)(const layer_t *layers, const batch_t *batch) {
     share_t shares[64];
     int64_t count = split(layers, batch, shares), n = batch->layers;
@@ -373,7 +207,7 @@ int NAMED(backward, SUFFIX)(const layer_t *layers, const batch_t *batch) {
     }
     /* Scratch first: whole tiles, so that each vector lies within a cache line. */
     size_t size = sizeof(float) * (tiles * 2 * widest * TILE + values + (count - 1) * grads);
-    float *memory = scratch_of((size + 63) / 64 * 64);
+    float *memory = sb3_sparse_scratch((size + 63) / 64 * 64);
     float **lists = malloc(sizeof *lists * n * (1 + 2 * count));
     if (!memory || !lists) {
         free(lists);
@@ -418,35 +252,4 @@ int NAMED(backward, SUFFIX)(const layer_t *layers, const batch_t *batch) {
         }
     free(lists);
     return 0;
-}
-
-/* WIDTH elements of x. */
-INLINE vec pick(const float *x, const int32_t *column) {
-#if WIDTH == 16
-    return (vec)_mm512_i32gather_ps(_mm512_loadu_si512(column), x, 4);
-#elif WIDTH == 8
-    return (vec)_mm256_i32gather_ps(x, _mm256_loadu_si256((const __m256i *)column), 4);
-#else
-    return (vec){x[column[0]], x[column[1]], x[column[2]], x[column[3]]};
-#endif
-}
-
-/* y = relu(W x + b) for one input. */
-void NAMED(single, SUFFIX)(const layer_t *layer, const float *x, float *y) {
-    for (int64_t r = 0; r < layer->rows; r++) {
-        vec even = {0}, odd = {0};
-        int32_t k = layer->row_start[r], end = layer->row_start[r + 1];
-        for (; k + 2 * WIDTH <= end; k += 2 * WIDTH) {
-            even += LOAD(layer->value + k) * pick(x, layer->column + k);
-            odd += LOAD(layer->value + k + WIDTH) * pick(x, layer->column + k + WIDTH);
-        }
-        if (k + WIDTH <= end) {
-            even += LOAD(layer->value + k) * pick(x, layer->column + k);
-            k += WIDTH;
-        }
-        float s = total(even + odd);
-        for (; k < end; k++) s += layer->value[k] * x[layer->column[k]];
-        if (layer->bias) s += layer->bias[r];
-        y[r] = layer->relu && s < 0 ? 0 : s;
-    }
 }

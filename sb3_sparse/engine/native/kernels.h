@@ -10,9 +10,11 @@
 #ifndef SB3_SPARSE_KERNELS_H
 #define SB3_SPARSE_KERNELS_H
 
+#include <stddef.h>
 #include <stdint.h>
 
 #define TILE 64
+#define LANES 16 /* of a small batch, which has tiles of its own */
 
 /* One layer, y = relu(W x + b). All fields are 8 bytes wide; Python fills them in this order. */
 typedef struct {
@@ -47,6 +49,39 @@ typedef struct {
     float *tiles_input_grad; /* the same in tiles, or NULL */
 } batch_t;
 
+/* Elementwise functions that may follow a layer when it acts. `a` and `b` are their parameters. */
+enum {
+    IDENTITY,
+    RELU,
+    TANH,
+    SIGMOID,
+    ELU,       /* a: factor of the negative part */
+    CELU,      /* a: alpha */
+    SELU,
+    GELU,
+    GELU_TANH, /* by its tanh approximation */
+    SILU,
+    MISH,
+    SOFTPLUS,  /* a: beta, b: threshold */
+    LEAKY_RELU, /* a: negative slope */
+    HARDTANH,  /* a: least, b: most */
+    HARDSWISH,
+};
+
+/* One layer of networks that act on up to LANES inputs. All fields are 8 bytes wide. */
+typedef struct {
+    int64_t rows, columns;
+    const int32_t *row_start; /* [rows + 1], or NULL where the weights are dense */
+    const int32_t *column;    /* [nnz] */
+    const float *value;       /* [nnz] by rows, or dense: [rows, columns] */
+    const float *mask;        /* of dense weights, 0 where they do not count; or NULL */
+    const float *bias;        /* [rows], or NULL */
+    int64_t activation;
+    double a, b;
+    int64_t from; /* number of the step whose result is the input; -1: the observations */
+    int64_t out;  /* feature of `y` at which the result [batch, rows] begins; -1: nobody reads it */
+} step_t;
+
 /* OpenMP as the process has it already: GOMP_parallel, omp_get_thread_num, omp_get_num_threads.
    A second pool of threads would fight with the one that waits, spinning, for torch's next call. */
 typedef struct {
@@ -56,12 +91,16 @@ typedef struct {
 } openmp_t;
 extern openmp_t sb3_sparse_openmp;
 
+/* Memory of this thread that stays for the next call: new pages cost as much as the products.
+   The address sanitizer gets exact sizes instead. `size` is a multiple of 64; NULL if there is none. */
+float *sb3_sparse_scratch(size_t size);
+
 #define JOIN(name, suffix) name##_##suffix
 #define NAMED(name, suffix) JOIN(name, suffix)
 
 #define DECLARE(suffix)                                                    \
     void NAMED(forward, suffix)(const layer_t *, const batch_t *);         \
     int NAMED(backward, suffix)(const layer_t *, const batch_t *);         \
-    void NAMED(single, suffix)(const layer_t *, const float *, float *);
+    int NAMED(act, suffix)(const step_t *, int64_t, int64_t, const float *, float *);
 
 #endif

@@ -11,7 +11,7 @@ import torch as th
 from sb3_sparse.errors import ConfigError, MissingKernels
 
 PATH = Path(__file__).with_name("kernels.so")
-VERSION = 1
+VERSION = 2
 """Of what the two sides hand each other; ``dispatch.c`` has the same."""
 
 
@@ -55,10 +55,10 @@ def library() -> ctypes.CDLL:
     if version != VERSION:
         raise MissingKernels(f"the library has version {version}, this package {VERSION}")
     found.sb3_sparse_instructions.restype = ctypes.c_char_p
-    found.sb3_sparse_single.argtypes = [
+    found.sb3_sparse_act.argtypes = [
         ctypes.c_void_p,
         ctypes.c_int64,
-        ctypes.c_void_p,
+        ctypes.c_int64,
         ctypes.c_void_p,
         ctypes.c_void_p,
     ]

@@ -1,0 +1,282 @@
+"""Networks that act: up to 16 inputs through all layers in one call of the kernels.
+
+In a rollout a layer is a few microseconds of arithmetic, and what surrounds it in torch is more.
+Here one call takes an observation through every layer, activation and head, and keeps nothing for a
+gradient. Masked layers are read through their masks, so what is inactive counts as 0 whoever has
+written it.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import struct
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple
+
+import torch as th
+from torch import nn
+from torch.nn.modules.module import _has_any_global_hook
+
+from sb3_sparse.engine.chains import watched
+from sb3_sparse.engine.linear import CompactLinear
+from sb3_sparse.engine.masked import FLOAT_MASK_KEY, MaskedLayer
+from sb3_sparse.engine.native.library import library, why_missing
+from sb3_sparse.engine.structure import Structure
+from sb3_sparse.engine.watch import Watch
+
+MOST_INPUTS = 16
+MOST_STEPS = 64
+
+Activation = Callable[[Any], tuple[int, float, float]]
+Paths = Sequence[Sequence[nn.Module]]
+"""Modules of each network in the order of computation."""
+OWN = ("torch.nn.", "sb3_sparse.engine.")
+"""Where a ``Sequential`` that calls its parts in turn is defined; one of the user's may do more."""
+ACTIVATIONS: dict[type[nn.Module], Activation] = {
+    nn.ReLU: lambda _: (1, 0.0, 0.0),
+    nn.Tanh: lambda _: (2, 0.0, 0.0),
+    nn.Sigmoid: lambda _: (3, 0.0, 0.0),
+    nn.ELU: lambda m: (4, m.alpha, 0.0),
+    nn.CELU: lambda m: (5, m.alpha, 0.0),
+    nn.SELU: lambda _: (6, 0.0, 0.0),
+    nn.GELU: lambda m: (7 if m.approximate == "none" else 8, 0.0, 0.0),
+    nn.SiLU: lambda _: (9, 0.0, 0.0),
+    nn.Mish: lambda _: (10, 0.0, 0.0),
+    nn.Softplus: lambda m: (11, m.beta, m.threshold),
+    nn.LeakyReLU: lambda m: (12, m.negative_slope, 0.0),
+    nn.ReLU6: lambda _: (13, 0.0, 6.0),
+    nn.Hardtanh: lambda m: (13, m.min_val, m.max_val),
+    nn.Hardswish: lambda _: (14, 0.0, 0.0),
+}
+"""Number and parameters of an activation in ``kernels.h``."""
+
+
+class Step(NamedTuple):
+    """One layer and the activation behind it.
+
+    :param layer: the layer
+    :param activation: what follows; None: nothing
+    :param source: number of the step whose result is its input; -1: the observations
+    """
+
+    layer: nn.Linear
+    activation: nn.Module | None
+    source: int
+
+
+class Binding(NamedTuple):
+    """Where the tensors lie, ready for the kernels; holds them, so that nobody frees them."""
+
+    tensors: list[int]
+    structures: list[Structure]
+    activations: list[tuple[int, float, float]]
+    arguments: Any
+    held: list[th.Tensor]
+
+
+class Inference:
+    """Networks that share their input, computed at once.
+
+    Made by :meth:`of`. Call it with inputs of shape ``(n, features)``.
+    """
+
+    def __init__(self, steps: list[Step], ends: list[int], modules: Iterable[nn.Module]) -> None:
+        self._steps = steps
+        self._ends = ends
+        self._columns = steps[0].layer.in_features
+        self._widths = [steps[end].layer.out_features for end in ends]
+        self._total = sum(self._widths)
+        self._layers = [step.layer for step in steps]
+        self._compact = [layer for layer in self._layers if isinstance(layer, CompactLinear)]
+        self._activations = [step.activation for step in steps if step.activation is not None]
+        self._hooks = [
+            hooks
+            for module in modules
+            for hooks in (module._forward_hooks, module._forward_pre_hooks)
+        ]
+        self._tensors: list[th.Tensor] = [
+            tensor
+            for layer in self._layers
+            for tensor in (layer.weight, layer.bias, layer._buffers.get(FLOAT_MASK_KEY))
+            if tensor is not None
+        ]
+        self._binding: Binding | None = None
+        self._call = library().sb3_sparse_act
+
+    @classmethod
+    def of(cls, paths: Paths, hooked: Iterable[nn.Module] = ()) -> Inference | None:
+        """What computes the networks at once; None if they have other parts than it knows.
+
+        :param paths: where two begin with the same layers, these are computed once
+        :param hooked: modules around them whose hooks would want to see the call
+        """
+        if why_missing() is not None:
+            return None
+        steps: list[Step] = []
+        places: dict[tuple[int, ...], int] = {}
+        ends = []
+        for path in paths:
+            parts = _parts(path)
+            if not parts:
+                return None
+            key: tuple[int, ...] = ()
+            source = -1
+            for layer, activation in parts:
+                key += (id(layer), id(activation))
+                if key not in places:
+                    places[key] = len(steps)
+                    steps.append(Step(layer, activation, source))
+                source = places[key]
+            ends.append(source)
+        inputs = {step.layer.in_features for step in steps if step.source < 0}
+        if len(steps) > MOST_STEPS or len(set(ends)) < len(ends) or len(inputs) > 1:
+            return None
+        return cls(steps, ends, [*hooked, *modules_of(paths)])
+
+    def __call__(self, x: th.Tensor) -> list[th.Tensor] | None:
+        """Each network's result, shape ``(n, its outputs)``, without a graph.
+
+        None where the modules must be called one by one: for more inputs than 16, or others than
+        float32 ones of the right width on the CPU, while somebody watches (hooks, tracing,
+        autocast), and for results that are not finite, about which callers have their own to say.
+
+        :param x: shape ``(n, features)``
+        """
+        n = x.shape[0]
+        if (
+            not 0 < n <= MOST_INPUTS
+            or x.dtype != th.float32
+            or x.shape != (n, self._columns)
+            or not x.is_cpu
+            or any(self._hooks)
+            or watched(x)
+            or th.is_autocast_enabled("cpu")
+            or _has_any_global_hook()  # type: ignore[no-untyped-call]
+        ):
+            return None
+        binding = self._bound()
+        if binding is None:
+            return None
+        x = x.contiguous().resolve_neg()
+        y = th.empty(n * self._total, dtype=th.float32, device="cpu")
+        if self._call(binding.arguments, len(self._steps), n, x.data_ptr(), y.data_ptr()):
+            self._remask()
+            return None
+        if len(self._widths) == 1:
+            return [y.view(n, self._total)]
+        parts = y.split([n * width for width in self._widths])
+        return [part.view(n, width) for part, width in zip(parts, self._widths, strict=True)]
+
+    def _remask(self) -> None:
+        """Let the modules compute what the kernels did: without what is inactive."""
+        for layer in self._layers:
+            if (masked := MaskedLayer.of(layer)) is not None:
+                masked.remask()
+
+    def _bound(self) -> Binding | None:
+        """Where the tensors lie now; None if the kernels cannot read one."""
+        tensors = [tensor.data_ptr() for tensor in self._tensors]
+        structures = [layer.structure for layer in self._compact]
+        activations = [ACTIVATIONS[type(module)](module) for module in self._activations]
+        binding = self._binding
+        if (
+            binding is not None
+            and tensors == binding.tensors
+            and structures == binding.structures
+            and activations == binding.activations
+            and all(tensor.is_contiguous() for tensor in self._tensors)
+        ):
+            return binding
+        self._binding = None
+        if not all(_readable(tensor) for tensor in self._tensors):
+            return None
+        if any(layer.snapshot is not None for layer in self._compact):
+            return None  # a target that awaits its copy
+        held = [tensor.detach() for tensor in self._tensors]
+        self._binding = Binding(tensors, structures, activations, self._arguments(), held)
+        return self._binding
+
+    def _arguments(self) -> Any:
+        """``step_t`` of every step."""
+        fields: list[int] = []
+        for number, (layer, activation, source) in enumerate(self._steps):
+            start = column = mask_place = 0
+            if isinstance(layer, CompactLinear):
+                start, column = layer.structure.addresses[:2]
+            elif (mask := layer._buffers.get(FLOAT_MASK_KEY)) is not None:
+                mask_place = mask.data_ptr()
+            kind, a, b = (0, 0.0, 0.0)
+            if activation is not None:
+                kind, a, b = ACTIVATIONS[type(activation)](activation)
+            out = -1
+            if number in self._ends:
+                out = sum(self._widths[: self._ends.index(number)])
+            bias = 0 if layer.bias is None else layer.bias.data_ptr()
+            fields += (layer.out_features, layer.in_features, start, column)
+            fields += (layer.weight.data_ptr(), mask_place, bias, kind, _bits(a), _bits(b))
+            fields += (source, out)
+        return (ctypes.c_int64 * len(fields))(*fields)
+
+
+def _parts(path: Iterable[nn.Module]) -> list[tuple[nn.Linear, nn.Module | None]] | None:
+    """Layers, each with its activation; None if there is anything else."""
+    parts: list[tuple[nn.Linear, nn.Module | None]] = []
+    for module in _leaves(path):
+        if type(module) in (nn.Linear, CompactLinear):
+            assert isinstance(module, nn.Linear)
+            parts.append((module, None))
+        elif type(module) in ACTIVATIONS and parts and parts[-1][1] is None:
+            parts[-1] = (parts[-1][0], module)
+        elif type(module) is not nn.Identity:
+            return None
+    return parts
+
+
+def _leaves(path: Iterable[nn.Module]) -> Iterable[nn.Module]:
+    for module in path:
+        if isinstance(module, nn.Sequential) and type(module).__module__.startswith(OWN):
+            yield from _leaves(module)
+        else:
+            yield module
+
+
+def modules_of(paths: Paths) -> list[nn.Module]:
+    """Every module on the paths, once."""
+    found = (inner for path in paths for module in path for inner in module.modules())
+    return list({id(module): module for module in found}.values())
+
+
+def _readable(tensor: th.Tensor) -> bool:
+    return tensor.dtype == th.float32 and tensor.is_cpu and tensor.is_contiguous()
+
+
+def _bits(number: float) -> int:
+    """A double as the integer of the same bits."""
+    found: int = struct.unpack("q", struct.pack("d", number))[0]
+    return found
+
+
+class KeptInference:
+    """An inference that is made anew when modules have changed. Copies and pickles begin empty."""
+
+    def __init__(self) -> None:
+        self._watch: Watch | None = None
+        self._inference: Inference | None = None
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> KeptInference:
+        return KeptInference()
+
+    def __reduce__(self) -> Any:
+        return KeptInference, ()
+
+    def get(self, find: Callable[[], tuple[Paths, list[nn.Module]]]) -> Inference | None:
+        """The inference; None where the modules must be called one by one.
+
+        :param find: the paths, and the modules around them from the outermost, whose hooks are run
+            anyhow, to those that the inference passes over
+        """
+        if self._watch is None or not self._watch.unchanged():
+            paths, around = find()
+            self._watch = Watch([*around, *modules_of(paths)])
+            self._inference = Inference.of(paths, around[1:])
+        return self._inference
