@@ -85,10 +85,14 @@ class Inference:
         self._ends = ends
         self._columns = steps[0].layer.in_features
         self._widths = [steps[end].layer.out_features for end in ends]
+        self._places = [sum(self._widths[:i]) for i in range(len(ends))]
         self._total = sum(self._widths)
         self._layers = [step.layer for step in steps]
         self._compact = [layer for layer in self._layers if isinstance(layer, CompactLinear)]
         self._activations = [step.activation for step in steps if step.activation is not None]
+        self._adjustable = [
+            module for module in self._activations if any(ACTIVATIONS[type(module)](module)[1:])
+        ]
         self._hooks = [
             hooks
             for module in modules
@@ -110,7 +114,7 @@ class Inference:
         :param paths: where two begin with the same layers, these are computed once
         :param hooked: modules around them whose hooks would want to see the call
         """
-        if why_missing() is not None:
+        if not paths or why_missing() is not None:
             return None
         steps: list[Step] = []
         places: dict[tuple[int, ...], int] = {}
@@ -142,11 +146,11 @@ class Inference:
 
         :param x: shape ``(n, features)``
         """
-        n = x.shape[0]
+        n, *features = x.shape
         if (
             not 0 < n <= MOST_INPUTS
-            or x.dtype != th.float32
-            or x.shape != (n, self._columns)
+            or features != [self._columns]
+            or x.dtype is not th.float32
             or not x.is_cpu
             or any(self._hooks)
             or watched(x)
@@ -157,15 +161,18 @@ class Inference:
         binding = self._bound()
         if binding is None:
             return None
-        x = x.contiguous().resolve_neg()
+        if not x.is_contiguous() or x.is_neg():
+            x = x.contiguous().resolve_neg()
         y = th.empty(n * self._total, dtype=th.float32, device="cpu")
         if self._call(binding.arguments, len(self._steps), n, x.data_ptr(), y.data_ptr()):
             self._remask()
             return None
         if len(self._widths) == 1:
             return [y.view(n, self._total)]
-        parts = y.split([n * width for width in self._widths])
-        return [part.view(n, width) for part, width in zip(parts, self._widths, strict=True)]
+        return [
+            y.as_strided((n, width), (width, 1), n * place)
+            for width, place in zip(self._widths, self._places, strict=True)
+        ]
 
     def _remask(self) -> None:
         """Let the modules compute what the kernels did: without what is inactive."""
@@ -177,14 +184,14 @@ class Inference:
         """Where the tensors lie now; None if the kernels cannot read one."""
         tensors = [tensor.data_ptr() for tensor in self._tensors]
         structures = [layer.structure for layer in self._compact]
-        activations = [ACTIVATIONS[type(module)](module) for module in self._activations]
+        activations = [ACTIVATIONS[type(module)](module) for module in self._adjustable]
         binding = self._binding
         if (
             binding is not None
             and tensors == binding.tensors
             and structures == binding.structures
             and activations == binding.activations
-            and all(tensor.is_contiguous() for tensor in self._tensors)
+            and all(map(th.Tensor.is_contiguous, self._tensors))
         ):
             return binding
         self._binding = None
@@ -210,7 +217,7 @@ class Inference:
                 kind, a, b = ACTIVATIONS[type(activation)](activation)
             out = -1
             if number in self._ends:
-                out = sum(self._widths[: self._ends.index(number)])
+                out = self._places[self._ends.index(number)]
             bias = 0 if layer.bias is None else layer.bias.data_ptr()
             fields += (layer.out_features, layer.in_features, start, column)
             fields += (layer.weight.data_ptr(), mask_place, bias, kind, _bits(a), _bits(b))
@@ -280,3 +287,27 @@ class KeptInference:
             self._watch = Watch([*around, *modules_of(paths)])
             self._inference = Inference.of(paths, around[1:])
         return self._inference
+
+
+def gaussian(
+    mean: th.Tensor, log_std: th.Tensor, noise: th.Tensor | None, result: th.Tensor
+) -> bool:
+    """Actions of Gaussians and their log probabilities; whether one is not finite.
+
+    :param mean: shape ``(n, dim)``; float32 on the CPU and contiguous, as all
+    :param log_std: shape ``(dim,)``
+    :param noise: of a standard normal distribution, shape ``(n, dim)``; None: the mean acts
+    :param result: shape ``(n * dim + n,)``: room for the actions, then for the log probabilities
+    """
+    n, size = mean.shape
+    at = result.data_ptr()
+    failed: int = library().sb3_sparse_gaussian(
+        n,
+        size,
+        mean.data_ptr(),
+        log_std.data_ptr(),
+        None if noise is None else noise.data_ptr(),
+        at,
+        at + 4 * n * size,
+    )
+    return bool(failed)

@@ -21,15 +21,17 @@ class Watch:
 
     def __init__(self, modules: Iterable[nn.Module], tensors: bool = True) -> None:
         kinds = ("_modules", "_parameters", "_buffers") if tensors else ("_modules",)
-        self._attributes = [vars(module) for module in modules]
-        self._named = [held[kind] for held in self._attributes for kind in kinds]
+        attributes = [vars(module) for module in modules]
+        named = [held[kind] for held in attributes for kind in kinds]
+        self._named = [names for names in named if names]
         self._seen: list[Any] = list(chain.from_iterable(map(dict.values, self._named)))
         self._ids = list(map(id, self._seen))
-        self._sizes = list(map(len, self._attributes))
+        self._sized = attributes + [names for names in named if not names]
+        self._sizes = list(map(len, self._sized))
 
     def unchanged(self) -> bool:
         """Whether all of it is as it was."""
         return (
             list(map(id, chain.from_iterable(map(dict.values, self._named)))) == self._ids
-            and list(map(len, self._attributes)) == self._sizes
+            and list(map(len, self._sized)) == self._sizes
         )

@@ -3,14 +3,22 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
+import torch as th
+from stable_baselines3.common.distributions import DiagGaussianDistribution, Distribution
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, NatureCNN
 
 from sb3_sparse.errors import UnsupportedError
+from sb3_sparse.policies.acting import Shortcut
 from sb3_sparse.policies.mixin import SparsePolicyMixin, with_extractor
+from sb3_sparse.policies.sampling import QuickCategorical, QuickGaussian, quick
 from sb3_sparse.policies.spec import NetworkSpec
+
+ACTOR = ("mlp_extractor.policy_net", "action_net")
+CRITIC = ("mlp_extractor.value_net", "value_net")
 
 
 class NoSuchPart(UnsupportedError, AttributeError):
@@ -33,6 +41,69 @@ class SparseActorCriticPolicy(SparsePolicyMixin, ActorCriticPolicy):
         ),
     }
     functional_gradients = True  # TRPO's actor; SB3 does not say which algorithm builds the policy
+    _shortcuts: Mapping[str, Shortcut] = {}
+
+    def _quicken(self) -> None:
+        if self.use_sde:
+            return  # its distribution asks for the actor's features too
+        self.action_dist = quick(self.action_dist)
+        self._shortcuts = {"actor": Shortcut((ACTOR,)), "critic": Shortcut((CRITIC,))}
+        if self.share_features_extractor:
+            self._shortcuts["both"] = Shortcut((ACTOR, CRITIC))
+
+    def _acts_alone(self) -> bool:
+        shortcut = self._shortcuts.get("actor")
+        return shortcut is not None and shortcut.inference(self) is not None
+
+    def _results(self, networks: str, obs: Any, extractor: Any) -> list[th.Tensor] | None:
+        shortcut = self._shortcuts.get(networks)
+        return None if shortcut is None else shortcut.results(self, obs, extractor)
+
+    def forward(
+        self, obs: Any, deterministic: bool = False
+    ) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
+        """As in SB3: actions, values of shape ``(n, 1)`` and log probabilities ``(n,)``."""
+        results = self._actor_and_critic(obs)
+        acted = None if results is None else self._act(results[0], deterministic)
+        if results is None or acted is None:
+            return super().forward(obs, deterministic)
+        actions, log_prob = acted
+        return actions.view(-1, *self.action_space.shape), results[1], log_prob  # type: ignore[misc]
+
+    def _actor_and_critic(self, obs: Any) -> list[th.Tensor] | None:
+        """What the actor's head and the critic give; None where modules must be called."""
+        if self.share_features_extractor:
+            return self._results("both", obs, self.features_extractor)
+        mean = self._results("actor", obs, self.pi_features_extractor)
+        values = None if mean is None else self._results("critic", obs, self.vf_features_extractor)
+        return None if mean is None or values is None else mean + values
+
+    def get_distribution(self, obs: Any) -> Distribution:
+        """As in SB3."""
+        results = self._results("actor", obs, self.pi_features_extractor)
+        if results is None:
+            return super().get_distribution(obs)
+        if isinstance(self.action_dist, DiagGaussianDistribution):
+            return self.action_dist.proba_distribution(results[0], self.log_std)
+        return self.action_dist.proba_distribution(action_logits=results[0])  # type: ignore[call-arg]
+
+    def predict_values(self, obs: Any) -> th.Tensor:
+        """As in SB3, shape ``(n, 1)``."""
+        results = self._results("critic", obs, self.vf_features_extractor)
+        return super().predict_values(obs) if results is None else results[0]
+
+    def _predict(self, observation: Any, deterministic: bool = False) -> th.Tensor:
+        results = self._results("actor", observation, self.pi_features_extractor)
+        acted = None if results is None else self._act(results[0], deterministic)
+        return super()._predict(observation, deterministic) if acted is None else acted[0]
+
+    def _act(self, result: th.Tensor, deterministic: bool) -> tuple[th.Tensor, th.Tensor] | None:
+        """Actions and log probabilities of what the actor's head gives."""
+        if isinstance(self.action_dist, QuickGaussian):
+            return self.action_dist.act(result, self.log_std, deterministic)
+        if isinstance(self.action_dist, QuickCategorical):
+            return self.action_dist.act(result, deterministic)
+        return None
 
     def __getattr__(self, name: str) -> Any:
         if name == "lstm_actor":  # what RecurrentPPO asks for first, before it checks the class

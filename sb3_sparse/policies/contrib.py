@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, NatureCNN
 from stable_baselines3.common.type_aliases import Schedule
 
 from sb3_sparse.errors import MissingExtra
 from sb3_sparse.policies.critics import PassesGradientsOn, SparseCriticsMixin
+from sb3_sparse.policies.gaussian import GaussianActor
 from sb3_sparse.policies.mixin import SparsePolicyMixin, with_extractor
 from sb3_sparse.policies.parts import ActingPart
 from sb3_sparse.policies.sac import GAUSSIAN_ACTOR, TWIN_CRITIC
@@ -26,7 +29,7 @@ except ImportError as error:
     raise MissingExtra("a sparse policy of TQC, QRDQN, CrossQ or TRPO", "contrib") from error
 
 
-class SparseTQCActor(ActingPart, TQCActor):
+class SparseTQCActor(GaussianActor, TQCActor):
     """Actor of TQC."""
 
 
@@ -50,10 +53,22 @@ SparseTQCMultiInputPolicy = with_extractor(SparseTQCPolicy, "MultiInput", Combin
 class SparseQuantileNetwork(ActingPart, QuantileNetwork):
     """Quantile network of QR-DQN."""
 
+    paths = (("quantile_net",),)
+    n_quantiles: int
+    action_space: spaces.Discrete
+
+    def forward(self, obs: Any) -> th.Tensor:
+        """As in sb3-contrib, shape ``(n, quantiles, actions)``."""
+        results = self.results(obs)
+        if results is None:
+            return super().forward(obs)
+        return results[0].view(-1, self.n_quantiles, int(self.action_space.n))
+
 
 class SparseQRDQNPolicy(SparsePolicyMixin, QRDQNPolicy):
     """Sparse quantile network for QR-DQN."""
 
+    quantile_net: SparseQuantileNetwork
     networks = {
         "quantile_net": NetworkSpec(
             roots=("quantile_net",),
@@ -67,6 +82,12 @@ class SparseQRDQNPolicy(SparsePolicyMixin, QRDQNPolicy):
         """As in sb3-contrib, of our class."""
         kwargs = self._update_features_extractor(self.net_args, features_extractor=None)
         return SparseQuantileNetwork(**kwargs).to(self.device)
+
+    def _acts_alone(self) -> bool:
+        return self.quantile_net.acts_alone()
+
+    def _quicken(self) -> None:
+        self.quantile_net.quicken()
 
 
 SparseQRDQNMlpPolicy = with_extractor(SparseQRDQNPolicy, "Mlp", FlattenExtractor)
@@ -96,7 +117,7 @@ def _zero_where(constant: th.Tensor, grad: th.Tensor) -> th.Tensor:
     return grad.masked_fill(constant, 0.0)
 
 
-class SparseCrossQActor(ActingPart, CrossQActor):
+class SparseCrossQActor(GaussianActor, CrossQActor):
     """Actor of CrossQ."""
 
 

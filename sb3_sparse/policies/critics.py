@@ -11,7 +11,6 @@ from stable_baselines3.common.policies import ContinuousCritic
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
-from sb3_sparse.policies.gaussian import quicken
 from sb3_sparse.policies.mixin import SparsePolicyMixin
 from sb3_sparse.policies.parts import ActingPart, SparsePart
 
@@ -59,6 +58,7 @@ class SparseCriticsMixin(SparsePolicyMixin):
     critic_class: ClassVar[type[PassesGradientsOn]] = SparseContinuousCritic
     actor_kwargs: dict[str, Any]
     critic_kwargs: dict[str, Any]
+    actor: ActingPart
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Any:
         """As in SB3, of :attr:`actor_class`."""
@@ -70,5 +70,8 @@ class SparseCriticsMixin(SparsePolicyMixin):
         kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
         return self.critic_class(**kwargs).to(self.device)
 
+    def _acts_alone(self) -> bool:
+        return self.actor.acts_alone()
+
     def _quicken(self) -> None:
-        quicken(self.get_submodule("actor"))
+        self.actor.quicken()

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import torch as th
 from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, NatureCNN
 from stable_baselines3.dqn.policies import DQNPolicy, QNetwork
 
@@ -13,10 +16,18 @@ from sb3_sparse.policies.spec import NetworkSpec
 class SparseQNetwork(ActingPart, QNetwork):
     """Q network of DQN."""
 
+    paths = (("q_net",),)
+
+    def forward(self, obs: Any) -> th.Tensor:
+        """As in SB3, shape ``(n, actions)``."""
+        results = self.results(obs)
+        return super().forward(obs) if results is None else results[0]
+
 
 class SparseDQNPolicy(SparsePolicyMixin, DQNPolicy):
     """Sparse Q network for DQN."""
 
+    q_net: SparseQNetwork
     networks = {
         "q_net": NetworkSpec(
             roots=("q_net",),
@@ -30,6 +41,12 @@ class SparseDQNPolicy(SparsePolicyMixin, DQNPolicy):
         """As in SB3, of our class."""
         kwargs = self._update_features_extractor(self.net_args, features_extractor=None)
         return SparseQNetwork(**kwargs).to(self.device)
+
+    def _acts_alone(self) -> bool:
+        return self.q_net.acts_alone()
+
+    def _quicken(self) -> None:
+        self.q_net.quicken()
 
 
 SparseDQNMlpPolicy = with_extractor(SparseDQNPolicy, "Mlp", FlattenExtractor)

@@ -12,8 +12,10 @@ from typing import Any
 
 import torch as th
 from stable_baselines3.common.distributions import SquashedDiagGaussianDistribution
-from torch import nn
+from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN
 from torch.autograd.function import once_differentiable
+
+from sb3_sparse.policies.parts import ActingPart
 
 LOG_OF_ROOT_OF_TWO_PI = 0.5 * math.log(2.0 * math.pi)
 
@@ -63,9 +65,26 @@ class QuickSquashedGaussian(SquashedDiagGaussianDistribution):
         )
         if log_prob.isnan().any():  # SB3 says what is wrong
             return super().log_prob_from_params(mean_actions, log_std)
+        self._remember(mean_actions, log_std)
+        return action, log_prob
+
+    def actions_from_params(
+        self, mean_actions: th.Tensor, log_std: th.Tensor, deterministic: bool = False
+    ) -> th.Tensor:
+        """As in SB3: actions of shape ``(n, dim)``."""
+        gaussian = mean_actions
+        if not deterministic:
+            noise = th.randn(gaussian.shape, dtype=gaussian.dtype, device=gaussian.device)
+            gaussian = mean_actions + log_std.exp() * noise
+        if gaussian.isnan().any():  # SB3 says what is wrong
+            return super().actions_from_params(mean_actions, log_std, deterministic)
+        self._remember(mean_actions, log_std)
+        self.gaussian_actions = gaussian
+        return gaussian.tanh()
+
+    def _remember(self, mean_actions: th.Tensor, log_std: th.Tensor) -> None:
         self._mean, self._log_std = mean_actions, log_std
         vars(self).pop("distribution", None)  # of other observations
-        return action, log_prob
 
     def __getattr__(self, name: str) -> Any:
         # Made when somebody asks for it, which training does not.
@@ -75,10 +94,29 @@ class QuickSquashedGaussian(SquashedDiagGaussianDistribution):
         return vars(self)["distribution"]
 
 
-def quicken(actor: nn.Module) -> None:
-    """Give an actor the quick distribution, where SB3 gave it the plain one (not with gSDE)."""
-    distribution = vars(actor).get("action_dist")
-    if type(distribution) is SquashedDiagGaussianDistribution:
-        vars(actor)["action_dist"] = QuickSquashedGaussian(
-            distribution.action_dim, distribution.epsilon
-        )
+class GaussianActor(ActingPart):
+    """Actor of SAC, TQC and CrossQ."""
+
+    paths = (("latent_pi", "mu"), ("latent_pi", "log_std"))
+    use_sde: bool
+
+    def quicken(self) -> None:
+        """Act and sample with fewer steps from now on; gSDE stays SB3's."""
+        if self.use_sde:
+            return
+        super().quicken()
+        distribution = vars(self).get("action_dist")
+        if type(distribution) is SquashedDiagGaussianDistribution:
+            self.action_dist = QuickSquashedGaussian(
+                distribution.action_dim, distribution.epsilon
+            )
+
+    def get_action_dist_params(self, obs: Any) -> tuple[th.Tensor, th.Tensor, dict[str, th.Tensor]]:
+        """As in SB3: mean and log standard deviation, shape ``(n, dim)`` each."""
+        results = self.results(obs)
+        if results is None:
+            found: tuple[th.Tensor, th.Tensor, dict[str, th.Tensor]]
+            found = super().get_action_dist_params(obs)  # type: ignore[misc]
+            return found
+        mean, log_std = results
+        return mean, log_std.clamp_(LOG_STD_MIN, LOG_STD_MAX), {}

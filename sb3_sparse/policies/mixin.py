@@ -9,7 +9,6 @@ from typing import Any, ClassVar, TypeVar
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import Schedule
 
@@ -19,6 +18,7 @@ from sb3_sparse.engine.linear import check_conversion
 from sb3_sparse.engine.optimizers import check_weight_decay, prefer_fused
 from sb3_sparse.engine.places import check_places
 from sb3_sparse.errors import CorruptStateError, UnsupportedError
+from sb3_sparse.policies.acting import Acts
 from sb3_sparse.policies.build import build_networks
 from sb3_sparse.policies.compiled import names_in, plain_names
 from sb3_sparse.policies.config import SparsityConfig
@@ -34,7 +34,7 @@ from sb3_sparse.policies.vectors import from_vector, to_vector
 Sparse = TypeVar("Sparse", bound="SparsePolicyMixin")
 
 
-class SparsePolicyMixin(BasePolicy):
+class SparsePolicyMixin(Acts):
     """Sparse networks inside an SB3 policy. SB3's own arguments keep their meaning.
 
     :param observation_space: as in SB3
@@ -185,12 +185,22 @@ class SparsePolicyMixin(BasePolicy):
 
     def set_training_mode(self, mode: bool) -> None:
         """As in SB3. Every ``train()`` calls it first: here a copied policy gets its hooks back."""
-        super().set_training_mode(mode)
-        check_places(self, self.sparse.layers)
+        if not self._switch(mode):
+            check_places(self, self.sparse.layers)
         if mode:
             self.sparse.begin_training(self)
         else:
             self.sparse.enforce()  # before anybody acts with what others have written
+
+    def _prepare_to_act(self) -> None:
+        if not self._switch(False):
+            check_places(self, self.sparse.layers)
+        if not self._acts_alone():
+            self.sparse.enforce()
+
+    def _acts_alone(self) -> bool:
+        """Whether the kernels act, which see masks, and no module reads a weight."""
+        raise NotImplementedError
 
     def parameters_to_vector(self) -> np.ndarray[Any, Any]:
         """As in SB3; kernels are dense in every storage, 0 where inactive."""

@@ -3,24 +3,25 @@
 from __future__ import annotations
 
 import copy
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
 from stable_baselines3.common.distributions import Distribution
-from stable_baselines3.common.policies import BaseModel, BasePolicy
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
 from sb3_sparse.engine.foreign import Guard
 from sb3_sparse.engine.masked import MaskedLayer
 from sb3_sparse.engine.plain import make_plain
+from sb3_sparse.policies.acting import Acts, Shortcut, SwitchesModes
 from sb3_sparse.policies.vectors import from_vector, to_vector
 
 WHOLE_POLICY = "a whole policy is copied"
 """Key of a memo of ``copy.deepcopy``."""
 
 
-class SparsePart(BaseModel):
+class SparsePart(SwitchesModes):
     """A network of a sparse policy, as ``model.actor`` or ``model.q_net``."""
 
     def __deepcopy__(self, memo: dict[Any, Any]) -> Any:
@@ -60,15 +61,44 @@ class SparsePart(BaseModel):
         from_vector(self, vector)
 
 
-class ActingPart(SparsePart, BasePolicy):
+class ActingPart(SparsePart, Acts):
     """A part that predicts by itself: an actor or a Q network."""
+
+    paths: ClassVar[tuple[tuple[str, ...], ...]]
+    """Each of its networks from the features on, by names of its modules."""
+    features_extractor: BaseFeaturesExtractor
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self._shortcut: Shortcut | None = None
+
+    def quicken(self) -> None:
+        """Act by the kernels from now on, where they know how."""
+        self._shortcut = Shortcut(self.paths)
+
+    def acts_alone(self) -> bool:
+        """Whether the kernels act, which see masks, and no module reads a weight."""
+        return self._shortcut is not None and self._shortcut.inference(self) is not None
+
+    def results(self, obs: Any) -> list[th.Tensor] | None:
+        """What each of :attr:`paths` gives; None where modules must be called one by one."""
+        if self._shortcut is None:
+            return None
+        return self._shortcut.results(self, obs, self.features_extractor)
 
     def predict(self, *args: Any, **kwargs: Any) -> Any:
         """As in SB3, with inactive weights at 0 whoever wrote them."""
+        if not self.acts_alone():
+            self._remask()
+        return super().predict(*args, **kwargs)
+
+    def _remask(self) -> None:
         for module in self.modules():
             if (layer := MaskedLayer.of(module)) is not None:
                 layer.remask()
-        return super().predict(*args, **kwargs)
+
+    def _prepare_to_act(self) -> None:
+        self.set_training_mode(False)
 
 
 def without_graphs(root: nn.Module) -> dict[int, Any]:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import torch as th
 from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, NatureCNN
 from stable_baselines3.td3.policies import Actor, TD3Policy
 
@@ -14,6 +17,13 @@ from sb3_sparse.policies.spec import NetworkSpec
 
 class SparseTD3Actor(ActingPart, Actor):
     """Actor of TD3 and DDPG."""
+
+    paths = (("mu",),)
+
+    def forward(self, obs: Any) -> th.Tensor:
+        """As in SB3, shape ``(n, dim)``."""
+        results = self.results(obs)
+        return super().forward(obs) if results is None else results[0]
 
 
 class SparseTD3Policy(SparseCriticsMixin, TD3Policy):

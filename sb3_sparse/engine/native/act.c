@@ -107,55 +107,47 @@ INLINE vec first(const float *from, int64_t left) {
 #endif
 }
 
-/* x[column], for WIDTH columns, or the first `left` and 0. */
-INLINE vec pick(const float *x, const int32_t *column) {
-#if WIDTH == 16
-    return (vec)_mm512_i32gather_ps(_mm512_loadu_si512(column), x, 4);
-#elif WIDTH == 8
-    return (vec)_mm256_i32gather_ps(x, _mm256_loadu_si256((const __m256i *)column), 4);
+/* Makes a compiler load one number at a time, which is quicker than what it would gather. */
+#if defined(__x86_64__)
+#define ALONE(x) __asm__("" : "+x"(x))
+#elif defined(__aarch64__)
+#define ALONE(x) __asm__("" : "+w"(x))
 #else
-    return (vec){x[column[0]], x[column[1]], x[column[2]], x[column[3]]};
+#define ALONE(x) (void)(x)
 #endif
-}
-INLINE vec pick_first(const float *x, const int32_t *column, int64_t left) {
-#if WIDTH == 16
-    __mmask16 some = (__mmask16)((1u << left) - 1);
-    return (vec)_mm512_mask_i32gather_ps(_mm512_setzero_ps(), some,
-                                         _mm512_maskz_loadu_epi32(some, column), x, 4);
-#else
-    vec found = {0};
-    for (int64_t i = 0; i < left; i++) found[i] = x[column[i]];
-    return found;
-#endif
+
+/* sum of value * x[column]. */
+INLINE float sparse_row(int64_t count, const int32_t *column, const float *value, const float *x) {
+    float sum[8] = {0};
+    int64_t k = 0;
+    for (; k + 8 <= count; k += 8)
+#pragma GCC unroll 8
+        for (int i = 0; i < 8; i++) {
+            float one = x[column[k + i]];
+            ALONE(one);
+            sum[i] += value[k + i] * one;
+        }
+    for (int64_t i = 0; k < count; k++, i++) {
+        float one = x[column[k]];
+        ALONE(one);
+        sum[i & 3] += value[k] * one;
+    }
+    return ((sum[0] + sum[1]) + (sum[2] + sum[3])) + ((sum[4] + sum[5]) + (sum[6] + sum[7]));
 }
 
 /* Weights that count; what does not is 0, even if it is no number. */
 INLINE vec counted(vec weights, vec mask) { return (vec)((ivec)weights & (mask != 0)); }
 
-/* Products of one row with one input, to be added up. */
-INLINE vec row_of(const step_t *step, int64_t r, const float *x) {
+/* sum of weight * x of a row without gaps, to be added up. */
+INLINE vec dense_row(int64_t columns, const float *w, const float *mask, const float *x) {
     vec sum = {0}, more = {0};
-    if (step->row_start) {
-        int64_t k = step->row_start[r], end = step->row_start[r + 1];
-        for (; k + 2 * WIDTH <= end; k += 2 * WIDTH) {
-            sum += LOAD(step->value + k) * pick(x, step->column + k);
-            more += LOAD(step->value + k + WIDTH) * pick(x, step->column + k + WIDTH);
-        }
-        for (; k < end; k += WIDTH)
-            if (end - k >= WIDTH)
-                sum += LOAD(step->value + k) * pick(x, step->column + k);
-            else
-                more += first(step->value + k, end - k) * pick_first(x, step->column + k, end - k);
-        return sum + more;
-    }
-    const float *w = step->value + r * step->columns;
-    const float *m = step->mask ? step->mask + r * step->columns : w; /* 0 either way */
+    const float *m = mask ? mask : w; /* what is 0 adds nothing either way */
     int64_t k = 0, left;
-    for (; k + 2 * WIDTH <= step->columns; k += 2 * WIDTH) {
+    for (; k + 2 * WIDTH <= columns; k += 2 * WIDTH) {
         sum += counted(LOAD(w + k), LOAD(m + k)) * LOAD(x + k);
         more += counted(LOAD(w + k + WIDTH), LOAD(m + k + WIDTH)) * LOAD(x + k + WIDTH);
     }
-    for (; (left = step->columns - k) > 0; k += WIDTH)
+    for (; (left = columns - k) > 0; k += WIDTH)
         if (left >= WIDTH)
             sum += counted(LOAD(w + k), LOAD(m + k)) * LOAD(x + k);
         else
@@ -165,14 +157,18 @@ INLINE vec row_of(const step_t *step, int64_t r, const float *x) {
 
 /* y = W x + b for one input. */
 static void one(const step_t *step, const float *x, float *y) {
-    for (int64_t r = 0; r < step->rows; r += 8) {
-        vec sum[8];
-        float sums[8];
-        int64_t count = step->rows - r < 8 ? step->rows - r : 8;
-        for (int64_t i = 0; i < count; i++) sum[i] = row_of(step, r + i, x);
-        for (int64_t i = count; i < 8; i++) sum[i] = (vec){0};
-        totals(sum, sums, 0);
-        for (int64_t i = 0; i < count; i++) y[r + i] = sums[i] + (step->bias ? step->bias[r + i] : 0);
+    for (int64_t r = 0; r < step->rows; r++) {
+        float bias = step->bias ? step->bias[r] : 0;
+        if (!step->row_start) {
+            const float *mask = step->mask ? step->mask + r * step->columns : 0;
+            y[r] = bias + total(dense_row(step->columns, step->value + r * step->columns, mask, x));
+            continue;
+        }
+        int64_t start = step->row_start[r], count = step->row_start[r + 1] - start;
+        if (count == step->columns)
+            y[r] = bias + total(dense_row(count, step->value + start, 0, x));
+        else
+            y[r] = bias + sparse_row(count, step->column + start, step->value + start, x);
     }
 }
 

@@ -1,6 +1,7 @@
 /* Chooses the kernels for the processor at run time. */
 #include "kernels.h"
 
+#include <math.h>
 #include <pthread.h>
 #include <stdlib.h>
 #include <string.h>
@@ -115,4 +116,23 @@ EXPORT int sb3_sparse_backward(const layer_t *layers, const batch_t *batch) {
 EXPORT int sb3_sparse_act(const step_t *steps, int64_t count, int64_t batch, const float *x,
                           float *y) {
     return chosen->act(steps, count, batch, x, y);
+}
+
+/* Actions mean + std * noise (without noise: the mean) of `count` Gaussians of `size` dimensions, and
+   their log probabilities. 1 if one is not finite, else 0. */
+EXPORT int sb3_sparse_gaussian(int64_t count, int64_t size, const float *mean, const float *log_std,
+                               const float *noise, float *action, float *log_prob) {
+    float wrong = 0;
+    for (int64_t n = 0; n < count; n++) {
+        log_prob[n] = 0;
+        for (int64_t d = 0; d < size; d++) {
+            float centre = mean[n * size + d], std = expf(log_std[d]);
+            float a = noise ? centre + std * noise[n * size + d] : centre;
+            float away = (a - centre) / std;
+            action[n * size + d] = a;
+            log_prob[n] -= away * away / 2 + log_std[d] + 0.918938533f; /* ln sqrt(2 pi) */
+        }
+        wrong += log_prob[n] - log_prob[n];
+    }
+    return wrong != wrong;
 }

@@ -62,6 +62,7 @@ def library() -> ctypes.CDLL:
         ctypes.c_void_p,
         ctypes.c_void_p,
     ]
+    found.sb3_sparse_gaussian.argtypes = [*(ctypes.c_int64,) * 2, *(ctypes.c_void_p,) * 5]
     _use(found, found.sb3_sparse_instructions(0).decode())
     _share_threads(found)
     return found

@@ -1,0 +1,162 @@
+"""Predictions of a few observations, as in a rollout: SB3's results with fewer steps on the way."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3.common.policies import BaseModel, BasePolicy
+from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
+from torch import nn
+
+from sb3_sparse.engine.inference import MOST_INPUTS, Inference, KeptInference, Paths
+from sb3_sparse.policies.modes import Modes
+from sb3_sparse.policies.storage import KNOWN
+
+Actions = NDArray[Any]
+ON_THE_WAY = (
+    "set_training_mode",
+    "obs_to_tensor",
+    "is_vectorized_observation",
+    "extract_features",
+    "forward",
+    "_predict",
+    "unscale_action",
+)
+"""What ``predict`` calls; a subclass of the user's own that has one of them gets SB3's."""
+
+
+class SwitchesModes(BaseModel):
+    """A policy or part of one that is put into training mode without a walk over its modules."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self._modes = Modes()
+
+    def set_training_mode(self, mode: bool) -> None:
+        """As in SB3."""
+        self._switch(mode)
+
+    def _switch(self, mode: bool) -> bool:
+        """Set the mode; whether all modules were the same as at the last switch."""
+        return self._modes.switch(self, super().set_training_mode, mode)
+
+
+class Acts(SwitchesModes, BasePolicy):
+    """A policy or part of one that predicts."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        space = self.observation_space
+        self._takes_vectors = isinstance(space, spaces.Box) and not is_image_space(space)
+
+    def predict(
+        self,
+        observation: Any,
+        state: tuple[Actions, ...] | None = None,
+        episode_start: Actions | None = None,
+        deterministic: bool = False,
+    ) -> tuple[Actions, tuple[Actions, ...] | None]:
+        """As in SB3."""
+        actions = self._predicted(observation, deterministic)
+        if actions is None:
+            return super().predict(observation, state, episode_start, deterministic)
+        return actions, state
+
+    def _predicted(self, observation: Any, deterministic: bool) -> Actions | None:
+        """Actions for vectors of numbers; None for anything else, about which SB3 knows more."""
+        if (
+            type(observation) is not np.ndarray
+            or not self._takes_vectors
+            or not _untouched(type(self), ON_THE_WAY)
+        ):
+            return None
+        shape = self.observation_space.shape
+        alone = observation.shape == shape
+        if not alone and observation.shape[1:] != shape:
+            return None
+        self._prepare_to_act()
+        with th.no_grad():
+            obs = np.array(observation).reshape((-1, *shape))
+            acted = self._predict(th.as_tensor(obs, device=self.device), deterministic)
+        actions: Actions = acted.cpu().numpy().reshape((-1, *self.action_space.shape))  # type: ignore[misc]
+        if isinstance(self.action_space, spaces.Box):
+            if self.squash_output:
+                actions = self.unscale_action(actions)
+            else:
+                actions = np.clip(actions, self.action_space.low, self.action_space.high)
+        return actions.squeeze(axis=0) if alone else actions
+
+    def _prepare_to_act(self) -> None:
+        """Be in evaluation mode, with inactive weights at 0 where modules will read them."""
+        raise NotImplementedError
+
+
+class Shortcut:
+    """The way from observations to the results of networks, in one call where it can be.
+
+    :param paths: modules of each network, from the features to the result, by dotted names
+    """
+
+    def __init__(self, paths: tuple[tuple[str, ...], ...]) -> None:
+        self._paths = paths
+        self._kept = KeptInference()
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Shortcut:
+        return Shortcut(self._paths)
+
+    def __reduce__(self) -> Any:
+        return Shortcut, (self._paths,)
+
+    def inference(self, root: nn.Module) -> Inference | None:
+        """What computes the networks at once; None where modules must be called one by one."""
+        return self._kept.get(lambda: self._find(root))
+
+    def _find(self, root: nn.Module) -> tuple[Paths, list[nn.Module]]:
+        if not _untouched(type(root), ("extract_features",)):
+            return [], [root]
+        paths = [[root.get_submodule(name) for name in path] for path in self._paths]
+        around = [root]
+        for path in self._paths:
+            for name in path:
+                parts = name.split(".")[:-1]
+                around += [root.get_submodule(".".join(parts[: i + 1])) for i in range(len(parts))]
+        around += [
+            module
+            for name, module in root.named_children()
+            if isinstance(module, BaseFeaturesExtractor)
+        ]
+        around = list({id(module): module for module in around}.values())
+        known = all(type(module).__module__.partition(".")[0] in KNOWN for module in around[1:])
+        return paths if known else [], around
+
+    def results(
+        self, root: Acts, obs: Any, extractor: BaseFeaturesExtractor
+    ) -> list[th.Tensor] | None:
+        """Each network's result; None where modules must be called one by one.
+
+        :param root: the policy or part
+        :param obs: observations as SB3 hands them to ``forward``
+        :param extractor: the features extractor that the networks share
+        """
+        if th.is_grad_enabled() or not isinstance(obs, th.Tensor):
+            return None
+        if not 0 < obs.shape[0] <= MOST_INPUTS:
+            return None
+        inference = self.inference(root)
+        if inference is None:
+            return None
+        if root._takes_vectors and type(extractor) is FlattenExtractor:
+            return inference(obs.float().flatten(1))
+        return inference(BaseModel.extract_features(root, obs, extractor))
+
+
+@cache
+def _untouched(kind: type, names: tuple[str, ...]) -> bool:
+    """Whether no subclass of the user's own has these methods."""
+    return all(getattr(kind, name).__module__.partition(".")[0] in KNOWN for name in names)

@@ -1,0 +1,65 @@
+"""Training and evaluation mode, switched without a walk over all modules."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from torch import nn
+
+from sb3_sparse.engine.watch import Watch
+
+SetMode = Callable[[bool], None]
+
+
+class Modes:
+    """Which modules SB3's ``set_training_mode`` switches, found out by doing it once.
+
+    SB3 walks over every module at each prediction and each round of training. The same flags are
+    set here directly, as long as the modules are the same. Copies and pickles begin anew.
+    """
+
+    def __init__(self) -> None:
+        self._watch: Watch | None = None
+        self._switched: list[dict[str, Any]] = []
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Modes:
+        return Modes()
+
+    def __reduce__(self) -> Any:
+        return Modes, ()
+
+    def switch(self, root: nn.Module, set_mode: SetMode, mode: bool) -> bool:
+        """Set the mode; whether the modules were still the same.
+
+        :param root: the policy or part
+        :param set_mode: SB3's way, which walks
+        :param mode: True for training
+        """
+        if self._watch is not None and self._watch.unchanged():
+            for attributes in self._switched:
+                attributes["training"] = mode
+            return True
+        self._learn(root, set_mode, mode)
+        return False
+
+    def _learn(self, root: nn.Module, set_mode: SetMode, mode: bool) -> None:
+        self._watch = None
+        modules = list(root.modules())
+        if any(_has_own_way(module) for module in modules):
+            set_mode(mode)
+            return
+        set_mode(not mode)
+        before = [module.training for module in modules]
+        set_mode(mode)
+        self._switched = [
+            vars(module)
+            for module, was in zip(modules, before, strict=True)
+            if module.training is not was
+        ]
+        self._watch = Watch(modules, tensors=False)
+
+
+def _has_own_way(module: nn.Module) -> bool:
+    """Whether it does more than set a flag, e.g. stays in evaluation mode for ever."""
+    return type(module).train is not nn.Module.train or "train" in vars(module)

@@ -1,0 +1,83 @@
+"""What SB3's distributions sample while acting, without the objects of ``torch.distributions``."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch as th
+from stable_baselines3.common.distributions import (
+    CategoricalDistribution,
+    DiagGaussianDistribution,
+    Distribution,
+)
+
+from sb3_sparse.engine.inference import gaussian
+
+
+class _MadeLater:
+    """Makes ``distribution`` when somebody asks for it, out of the last parameters."""
+
+    def __init__(self, action_dim: int) -> None:
+        super().__init__(action_dim)  # type: ignore[call-arg]
+        self._last: tuple[th.Tensor, ...] | None = None
+
+    def remember(self, *parameters: th.Tensor) -> None:
+        """Be the distribution of these parameters of SB3's ``proba_distribution``."""
+        self._last = parameters
+        vars(self).pop("distribution", None)
+
+    def __getattr__(self, name: str) -> Any:
+        last = vars(self).get("_last")
+        if name != "distribution" or last is None:
+            raise AttributeError(name)
+        self.proba_distribution(*last)  # type: ignore[attr-defined]
+        return vars(self)["distribution"]
+
+
+class QuickGaussian(_MadeLater, DiagGaussianDistribution):
+    """SB3's distribution for PPO and A2C with another :meth:`act`; everything else is SB3's."""
+
+    def act(
+        self, mean: th.Tensor, log_std: th.Tensor, deterministic: bool
+    ) -> tuple[th.Tensor, th.Tensor] | None:
+        """Actions and their log probabilities, shapes ``(n, dim)`` and ``(n,)``, without a graph.
+
+        They are those of SB3, of the same random numbers. None if a result is not finite.
+
+        :param mean: shape ``(n, dim)``
+        :param log_std: shape ``(dim,)``
+        """
+        n, size = mean.shape
+        noise = None if deterministic else th.randn((n, size), dtype=th.float32)
+        made = th.empty(n * size + n, dtype=th.float32)
+        if gaussian(mean, log_std, noise, made):
+            return None
+        self.remember(mean, log_std)
+        return made.as_strided((n, size), (size, 1), 0), made.as_strided((n,), (1,), n * size)
+
+
+class QuickCategorical(_MadeLater, CategoricalDistribution):
+    """SB3's distribution for PPO and A2C with another :meth:`act`; everything else is SB3's."""
+
+    def act(self, logits: th.Tensor, deterministic: bool) -> tuple[th.Tensor, th.Tensor] | None:
+        """Actions and their log probabilities, shapes ``(n,)``, without a graph.
+
+        :param logits: shape ``(n, actions)``
+        """
+        log_probs = logits.log_softmax(dim=1)
+        probs = log_probs.exp()
+        if deterministic:
+            actions = probs.argmax(dim=1, keepdim=True)
+        else:
+            actions = th.multinomial(probs, 1, True)
+        self.remember(logits)
+        return actions.squeeze(1), log_probs.gather(1, actions).squeeze(1)
+
+
+def quick(distribution: Distribution) -> Distribution:
+    """A quick distribution in place of SB3's own; any other as it is."""
+    if type(distribution) is DiagGaussianDistribution:
+        return QuickGaussian(distribution.action_dim)
+    if type(distribution) is CategoricalDistribution:
+        return QuickCategorical(distribution.action_dim)
+    return distribution
