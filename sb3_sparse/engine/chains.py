@@ -70,8 +70,6 @@ class Chain:
         ):
             y: th.Tensor = Products.apply(how, x, *parameters)  # type: ignore[no-untyped-call]
             return y
-        if batch == 1 and not tiled_in and not tiled_out:
-            return how.single(x, parameters)
         return how.forward(x, parameters)[0]
 
 

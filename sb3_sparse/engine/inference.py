@@ -146,6 +146,8 @@ class Inference:
 
         :param x: shape ``(n, features)``
         """
+        if watched(x):
+            return None
         n, *features = x.shape
         if (
             not 0 < n <= MOST_INPUTS
@@ -153,7 +155,6 @@ class Inference:
             or x.dtype is not th.float32
             or not x.is_cpu
             or any(self._hooks)
-            or watched(x)
             or th.is_autocast_enabled("cpu")
             or _has_any_global_hook()  # type: ignore[no-untyped-call]
         ):

@@ -84,20 +84,6 @@ class Pass(NamedTuple):
             )
         return arguments
 
-    def single(self, x: th.Tensor, parameters: Sequence[Any]) -> th.Tensor:
-        """One input, row by row; nothing is kept."""
-        y = _empty(1, self.rows)
-        spare = _empty(2 * max(structure.shape[0] for structure in self.structures))
-        arguments = self.arguments(parameters, [0] * len(self.structures))
-        library().sb3_sparse_single(
-            (ctypes.c_int64 * len(arguments))(*arguments),
-            len(self.structures),
-            x.data_ptr(),
-            spare.data_ptr(),
-            y.data_ptr(),
-        )
-        return y
-
     def forward(
         self, x: th.Tensor, parameters: Sequence[Any]
     ) -> tuple[th.Tensor, th.Tensor, list[int]]:

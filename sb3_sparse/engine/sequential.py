@@ -10,25 +10,10 @@ from torch import nn
 from torch.nn.modules.module import _has_any_global_hook
 
 from sb3_sparse.engine.chains import Chain, watched
+from sb3_sparse.engine.inference import ACTIVATIONS, KeptInference
 from sb3_sparse.engine.linear import CompactLinear
 
-ELEMENTWISE = (
-    nn.ReLU,
-    nn.Tanh,
-    nn.Sigmoid,
-    nn.ELU,
-    nn.CELU,
-    nn.SELU,
-    nn.GELU,
-    nn.SiLU,
-    nn.Mish,
-    nn.Softplus,
-    nn.LeakyReLU,
-    nn.ReLU6,
-    nn.Hardtanh,
-    nn.Hardswish,
-    nn.Identity,
-)
+ELEMENTWISE = (*ACTIVATIONS, nn.Identity)
 """Activations that may work on tiles as they are."""
 HOOKS = ("_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_pre_hooks")
 
@@ -42,12 +27,15 @@ class ChainedSequential(nn.Sequential):
 
     _seen: tuple[nn.Module, ...]
     _steps: list[tuple[Any, bool, bool]]
+    _kept: KeptInference
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_seen": (), "_steps": []}
 
     def forward(self, input: th.Tensor) -> th.Tensor:
         """As of ``Sequential``."""
+        if not th.is_grad_enabled() and (results := self._inferred(input)) is not None:
+            return results[0]
         modules = tuple(self._modules.values())
         hooked = any(getattr(module, hooks) for module in modules for hooks in HOOKS)
         if hooked or watched(input) or _has_any_global_hook():  # type: ignore[no-untyped-call]
@@ -66,6 +54,10 @@ class ChainedSequential(nn.Sequential):
             if not tiled_out:
                 x = x.view(*lead, step.rows)
         return x
+
+    def _inferred(self, x: th.Tensor) -> list[th.Tensor] | None:
+        inference = self._kept.get(lambda: ([[self]], [self]))
+        return None if inference is None else inference(x)
 
 
 def _steps(modules: Sequence[Any]) -> list[tuple[Any, bool, bool]]:
@@ -103,7 +95,8 @@ def chain_up(root: nn.Module) -> None:
             continue
         if any(isinstance(child, CompactLinear) for child in module.children()):
             module.__class__ = ChainedSequential
-            vars(module).update(_seen=(), _steps=[])  # more of them may be compact now
+            # More of them may be compact now.
+            vars(module).update(_seen=(), _steps=[], _kept=KeptInference())
         elif type(module) is ChainedSequential:
             unchain(module)
 
@@ -111,4 +104,4 @@ def chain_up(root: nn.Module) -> None:
 def unchain(module: ChainedSequential) -> None:
     """Make it a plain ``Sequential`` again, in place."""
     module.__class__ = nn.Sequential  # type: ignore[assignment]
-    del module._seen, module._steps
+    del module._seen, module._steps, module._kept

@@ -14,6 +14,7 @@ from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
 from torch import nn
 
+from sb3_sparse.engine.chains import watched
 from sb3_sparse.engine.inference import MOST_INPUTS, Inference, KeptInference, Paths
 from sb3_sparse.policies.modes import Modes
 from sb3_sparse.policies.storage import KNOWN
@@ -144,9 +145,7 @@ class Shortcut:
         :param obs: observations as SB3 hands them to ``forward``
         :param extractor: the features extractor that the networks share
         """
-        if th.is_grad_enabled() or not isinstance(obs, th.Tensor):
-            return None
-        if not 0 < obs.shape[0] <= MOST_INPUTS:
+        if th.is_grad_enabled() or watched(obs) or not 0 < obs.shape[0] <= MOST_INPUTS:
             return None
         inference = self.inference(root)
         if inference is None:

@@ -59,9 +59,30 @@ def one_pass(lib, random, widths: list[int], batch: int, tiled: bool, threads: i
     )
     lib.sb3_sparse_forward(packed, argument)
     assert lib.sb3_sparse_backward(packed, argument) == 0
-    lone, spare, result = buffer(into), buffer(2 * max(widths[1:])), buffer(out)
-    pointers = [ctypes.c_void_p(address(array)) for array in (lone, spare, result)]
-    lib.sb3_sparse_single(packed, ctypes.c_int64(len(widths) - 1), *pointers)
+
+
+def one_act(lib, random, widths: list[int], batch: int, broken: bool):
+    """A trunk with two heads, of layers of every storage."""
+    steps, kept, total = [], [], 0
+    for number, (columns, rows) in enumerate([*zip(widths, widths[1:], strict=False), widths[-2:]]):
+        storage = random.choice(["sparse", "masked", "dense"])
+        arrays = structure(random, rows, columns, random.choice([0.0, 0.3, 1.0]), broken)
+        sparse = storage == "sparse"
+        values = buffer(len(arrays[1])) if sparse else buffer(rows, columns)
+        mask = buffer(rows, columns) if storage == "masked" else None
+        bias = buffer(rows) if random.random() < 0.5 else None
+        kept += [arrays, values, mask, bias]
+        head = number >= len(widths) - 2
+        places = map(address, arrays[:2]) if sparse else (0, 0)
+        steps += [rows, columns, *places, address(values), address(mask), address(bias)]
+        source = number - 1 - (number == len(widths) - 1)
+        steps += [int(random.integers(15)), 0, 0, source, total if head else -1]
+        total += rows if head else 0
+    packed = (ctypes.c_int64 * len(steps))(*steps)
+    x, y = buffer(batch, widths[0]), buffer(batch, total)
+    pointers = [ctypes.c_void_p(address(array)) for array in (x, y)]
+    count = ctypes.c_int64(len(widths))
+    assert lib.sb3_sparse_act(packed, count, ctypes.c_int64(batch), *pointers) in (0, 1)
 
 
 def main() -> None:
@@ -80,6 +101,11 @@ def main() -> None:
                 widths = random.integers(1, 40, size=random.integers(2, 5)).tolist()
                 one_pass(lib, random, widths, batch, tiled, threads, bool(broken))
                 count += 1
+    for batch in (1, 2, 4, 5, 8, 9, 12, 13, 16):
+        for _ in range(8):
+            widths = random.integers(1, 40, size=random.integers(3, 6)).tolist()
+            one_act(lib, random, widths, batch, bool(broken))
+            count += 1
     print(count, "passes")
 
 

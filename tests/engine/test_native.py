@@ -65,7 +65,7 @@ def test_a_damaged_library_does_not_load(relocated):
 def test_a_library_of_another_version_is_refused(monkeypatch):
     monkeypatch.setattr(library, "VERSION", library.VERSION + 1)
     library.library.cache_clear()
-    with pytest.raises(SparsityError, match=r"library has version 1, this package 2"):
+    with pytest.raises(SparsityError, match=r"library has version \d+, this package \d+"):
         library.library()
     library.library.cache_clear()
 

@@ -1,0 +1,313 @@
+"""Networks in one call of the kernels against their modules, called one by one."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+from functools import partial
+
+import numpy as np
+import pytest
+import torch as th
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import nn
+
+from sb3_sparse.engine.inference import ACTIVATIONS, Inference, KeptInference, gaussian
+from sb3_sparse.engine.linear import CompactLinear
+from sb3_sparse.engine.masked import MaskedLayer
+from sb3_sparse.engine.native import library
+from sb3_sparse.engine.structure import Structure
+
+ELEMENTWISE = [
+    *(kind for kind in ACTIVATIONS if kind is not nn.GELU),
+    partial(nn.ELU, 1.7),
+    partial(nn.CELU, 0.6),
+    nn.GELU,
+    partial(nn.GELU, "tanh"),
+    partial(nn.Softplus, 2.0, 5.0),
+    partial(nn.LeakyReLU, 0.2),
+    partial(nn.Hardtanh, -0.5, 0.75),
+]
+STORAGES = ("plain", "masked", "compact")
+
+
+@pytest.fixture(params=library.instruction_sets())
+def instructions(request):
+    before = library.in_use()
+    library.use(request.param)
+    yield request.param
+    library.use(before)
+
+
+def stored(layer: nn.Linear, storage: str, density: float, random: np.random.Generator):
+    """The layer under a random mask, kept in one of the storages."""
+    mask = random.random(tuple(layer.weight.shape)) < density
+    if storage == "plain":
+        return layer
+    if storage == "masked":
+        masked = MaskedLayer("layer", layer)
+        masked.set_mask(mask)
+        return layer
+    with th.no_grad():
+        layer.weight.mul_(th.from_numpy(mask))
+    return CompactLinear.convert(layer, Structure.of_mask(mask, mask.shape), is_target=False)
+
+
+def dense_twin(layer: nn.Linear) -> nn.Linear:
+    twin = nn.Linear(layer.in_features, layer.out_features, bias=layer.bias is not None).double()
+    dense = layer.dense() if isinstance(layer, CompactLinear) else layer.weight
+    with th.no_grad():
+        twin.weight.copy_(dense)
+        if layer.bias is not None:
+            twin.bias.copy_(layer.bias)
+    return twin
+
+
+def by_modules(network: nn.Sequential, x: th.Tensor) -> th.Tensor:
+    """In double precision, dense."""
+    modules = (dense_twin(m) if isinstance(m, nn.Linear) else m for m in network)
+    return nn.Sequential(*modules)(x.double()).detach()
+
+
+def network(widths, storages, activation, density=0.4, bias=True, seed=0) -> nn.Sequential:
+    random = np.random.default_rng(seed)
+    th.manual_seed(seed)
+    modules: list[nn.Module] = []
+    for i, (columns, rows) in enumerate(zip(widths, widths[1:], strict=False)):
+        layer = nn.Linear(columns, rows, bias=bias)
+        modules.append(stored(layer, storages[i % len(storages)], density, random))
+        modules.append(activation())
+    return nn.Sequential(*modules[:-1])
+
+
+def close(ours: th.Tensor, theirs: th.Tensor) -> None:
+    assert ours.dtype == th.float32
+    scale = 1e-6 * (1 + theirs.abs().max())
+    np.testing.assert_allclose(ours, theirs, rtol=2e-6, atol=4 * float(scale))
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    widths=st.lists(st.integers(1, 70), min_size=2, max_size=4),
+    storages=st.lists(st.sampled_from(STORAGES), min_size=1, max_size=3),
+    activation=st.sampled_from(ELEMENTWISE),
+    density=st.sampled_from([0.0, 0.05, 0.4, 1.0]),
+    bias=st.booleans(),
+    batch=st.integers(1, 16),
+    instructions=st.sampled_from(library.instruction_sets()),
+    seed=st.integers(0, 1000),
+)
+def test_any_network_of_any_storage_gives_what_its_modules_give(
+    widths, storages, activation, density, bias, batch, instructions, seed
+):
+    before = library.in_use()
+    library.use(instructions)
+    try:
+        net = network(widths, storages, activation, density, bias, seed)
+        x = 2 * th.randn(batch, widths[0])
+        (ours,) = Inference.of([[net]])(x)
+    finally:
+        library.use(before)
+    close(ours, by_modules(net, x))
+
+
+@pytest.mark.parametrize("activation", ELEMENTWISE)
+def test_every_activation_is_torchs_from_end_to_end_of_its_range(instructions, activation):
+    points = th.cat([th.linspace(-90, 90, 1000), th.linspace(-1.5, 1.5, 1000), th.zeros(1)])
+    layer = nn.Linear(1, len(points))
+    with th.no_grad():
+        layer.weight.copy_(points[:, None])
+        layer.bias.zero_()
+    (ours,) = Inference.of([[layer, activation()]])(th.ones(1, 1))
+    np.testing.assert_allclose(
+        ours[0], activation()(points.double()), rtol=2e-6, atol=4e-7, err_msg=str(activation)
+    )
+
+
+def test_heads_share_their_trunk(instructions):
+    trunk = network([5, 8, 9], ["compact"], nn.Tanh)
+    heads = nn.Linear(9, 2), nn.Linear(9, 3)
+    other = nn.Linear(5, 4)
+    found = Inference.of([[trunk, heads[0]], [trunk, heads[1]], [other]])
+    x = th.randn(3, 5)
+    assert len(found._steps) == 5
+    results = found(x)
+    for ours, path in zip(results, ([trunk, heads[0]], [trunk, heads[1]], [other]), strict=True):
+        flat = [m for p in path for m in (p if isinstance(p, nn.Sequential) else [p])]
+        close(ours, by_modules(nn.Sequential(*flat), x))
+
+
+@pytest.mark.parametrize(
+    "modules",
+    [
+        [nn.Linear(3, 3), nn.LayerNorm(3)],
+        [nn.Linear(3, 3), nn.Dropout()],
+        [nn.Tanh(), nn.Linear(3, 3)],
+        [nn.Linear(3, 3), nn.Tanh(), nn.Tanh()],
+        [nn.Linear(3, 3), nn.PReLU()],
+        [type("Own", (nn.Linear,), {})(3, 3)],
+        [type("OwnSequential", (nn.Sequential,), {})(nn.Linear(3, 3))],
+        [],
+    ],
+)
+def test_other_modules_are_called_one_by_one(modules):
+    assert Inference.of([modules]) is None
+
+
+@pytest.mark.parametrize(
+    "x",
+    [
+        th.randn(17, 5),
+        th.randn(0, 5),
+        th.randn(2, 4),
+        th.randn(5),
+        th.randn(2, 1, 5),
+        th.randn(2, 5).double(),
+        th.full((1, 5), th.nan),
+        th.full((1, 5), th.inf),
+    ],
+)
+def test_inputs_that_it_does_not_take_and_results_without_end_are_left_to_the_modules(x):
+    assert Inference.of([[network([5, 4, 3], ["masked"], nn.ReLU)]])(x) is None
+
+
+def test_whoever_watches_gets_the_modules():
+    net = network([5, 4, 3], ["compact", "masked"], nn.Tanh)
+    found = Inference.of([[net]])
+    x = th.randn(2, 5)
+    for module in (net[0], net[1]):
+        for hook in (module.register_forward_hook, module.register_forward_pre_hook):
+            handle = hook(lambda *_: None)
+            assert found(x) is None
+            handle.remove()
+            assert found(x) is not None
+    with th.autocast("cpu", dtype=th.bfloat16):
+        assert found(x) is None
+    handle = nn.modules.module.register_module_forward_hook(lambda *_: None)
+    assert found(x) is None
+    handle.remove()
+    assert th.func.vmap(lambda row: th.zeros(1) if found(row[None]) is None else row)(x).sum() == 0
+    assert found(x) is not None
+
+
+def test_an_input_that_is_not_contiguous_is_read_right():
+    net = network([5, 4, 3], ["compact"], nn.Tanh)
+    x = th.randn(5, 4).T
+    close(Inference.of([[net]])(x)[0], by_modules(net, x))
+
+
+def write(net):
+    with th.no_grad():
+        net[0].weight.mul_(3)
+        net[2].bias.add_(1)
+
+
+def new_data(net):
+    net[2].weight.data = net[2].weight.data * 2
+    net[0].bias.data = net[0].bias.data + 1
+
+
+def move(net):
+    layer = net[0]
+    if isinstance(layer, CompactLinear):
+        dense = layer.dense()
+        layer.take(Structure.of_mask(dense.numpy() == 0, layer.structure.shape), th.ones_like(dense))
+    else:
+        mask = MaskedLayer.of(layer)
+        mask.set_mask(~mask.mask())
+        mask.write(th.ones(layer.weight.shape))
+
+
+def exchange(net):
+    net[1] = nn.ReLU()
+
+
+def new_layer(net):
+    net[2] = nn.Linear(6, 3)
+
+
+def new_parameter(net):
+    net[2].bias = nn.Parameter(th.ones(3))
+
+
+def steeper(net):
+    net[1].alpha = 4.0
+
+
+@pytest.mark.parametrize("storage", ["masked", "compact"])
+@pytest.mark.parametrize(
+    "change", [write, new_data, move, exchange, new_layer, new_parameter, steeper]
+)
+def test_it_follows_every_change(storage, change):
+    net = network([5, 6, 3], [storage], partial(nn.ELU, 1.5))
+    kept = KeptInference()
+    x = th.randn(2, 5)
+
+    def now() -> th.Tensor:
+        return kept.get(lambda: ([[net]], [net]))(x)[0].clone()
+
+    before = now()
+    change(net)
+    assert not th.equal(now(), before)
+    close(now(), by_modules(net, x))
+
+
+def test_a_square_weight_that_is_transposed_in_place_is_not_misread():
+    layer = nn.Linear(4, 4)
+    found = Inference.of([[layer]])
+    assert found(th.randn(1, 4)) is not None
+    layer.weight.data = layer.weight.data.T
+    assert found(th.randn(1, 4)) is None
+
+
+def test_what_is_inactive_counts_as_zero_whoever_wrote_it(instructions):
+    net = network([5, 6, 3], ["masked"], nn.Tanh)
+    x = th.randn(4, 5)
+    expected = by_modules(net, x)
+    for layer in (net[0], net[2]):
+        inactive = MaskedLayer.of(layer).float_mask == 0
+        layer.weight.data[inactive] = th.tensor([th.nan, th.inf, 3.0]).repeat(30)[: inactive.sum()]
+    for batch in (1, 4):
+        close(Inference.of([[net]])(x[:batch])[0], expected[:batch])
+
+
+def test_modules_that_take_over_see_no_inactive_weight_either():
+    net = network([5, 6, 3], ["masked"], nn.Tanh)
+    net[0].weight.data.add_(1.0)
+    assert Inference.of([[net]])(th.full((1, 5), th.nan)) is None
+    assert (net[0].weight[MaskedLayer.of(net[0]).float_mask == 0] == 0).all()
+
+
+def test_copies_and_pickles_begin_empty():
+    net = network([5, 6, 3], ["compact"], nn.Tanh)
+    kept = KeptInference()
+    assert kept.get(lambda: ([[net]], [net])) is not None
+    for twin in (copy.deepcopy(kept), pickle.loads(pickle.dumps(kept))):
+        assert vars(twin) == vars(KeptInference())
+
+
+@given(
+    mean=st.floats(-50, 50, width=32),
+    log_std=st.floats(-15, 10, width=32),
+    noise=st.floats(-4, 4, width=32),
+)
+def test_gaussian_actions_and_log_probabilities_are_those_of_the_formula(mean, log_std, noise):
+    made = th.empty(2 * 3 + 2)
+    means = th.tensor([[mean, 0.5, -1.0], [0.0, 0.0, 0.0]])
+    noises = th.tensor([[noise, 0.0, 1.0], [0.5, -0.5, 2.0]])
+    log_stds = th.tensor([log_std, 0.0, -1.0])
+    assert not gaussian(means, log_stds, noises, made)
+    actions = means + log_stds.exp() * noises
+    np.testing.assert_allclose(made[:6].view(2, 3), actions, rtol=1e-6, atol=1e-6)
+    taken = made[:6].view(2, 3).double()
+    std = log_stds.double().exp()
+    density = th.exp(-0.5 * ((taken - means) / std) ** 2) / (std * np.sqrt(2 * np.pi))
+    np.testing.assert_allclose(made[6:], density.log().sum(dim=1), rtol=1e-5, atol=1e-4)
+
+
+def test_a_gaussian_without_end_is_reported():
+    made = th.empty(2)
+    assert gaussian(th.zeros(1, 1), th.tensor([-200.0]), None, made)
+    assert gaussian(th.full((1, 1), th.nan), th.zeros(1), None, made)
+    assert not gaussian(th.zeros(1, 1), th.zeros(1), None, made)
