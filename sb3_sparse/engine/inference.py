@@ -114,7 +114,9 @@ class Inference:
         :param paths: where two begin with the same layers, these are computed once
         :param hooked: modules around them whose hooks would want to see the call
         """
-        if not paths or why_missing() is not None:
+        modules = [*hooked, *modules_of(paths)]
+        patched = any("forward" in vars(module) for module in modules)
+        if not paths or patched or why_missing() is not None:
             return None
         steps: list[Step] = []
         places: dict[tuple[int, ...], int] = {}
@@ -135,7 +137,7 @@ class Inference:
         inputs = {step.layer.in_features for step in steps if step.source < 0}
         if len(steps) > MOST_STEPS or len(set(ends)) < len(ends) or len(inputs) > 1:
             return None
-        return cls(steps, ends, [*hooked, *modules_of(paths)])
+        return cls(steps, ends, modules)
 
     def __call__(self, x: th.Tensor) -> list[th.Tensor] | None:
         """Each network's result, shape ``(n, its outputs)``, without a graph.

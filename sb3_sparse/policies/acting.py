@@ -77,7 +77,7 @@ class Acts(SwitchesModes, BasePolicy):
             or not _untouched(type(self), ON_THE_WAY)
         ):
             return None
-        shape = self.observation_space.shape
+        shape, acts = self.observation_space.shape or (), self.action_space.shape or ()
         alone = observation.shape == shape
         if not alone and observation.shape[1:] != shape:
             return None
@@ -85,7 +85,7 @@ class Acts(SwitchesModes, BasePolicy):
         with th.no_grad():
             obs = np.array(observation).reshape((-1, *shape))
             acted = self._predict(th.as_tensor(obs, device=self.device), deterministic)
-        actions: Actions = acted.cpu().numpy().reshape((-1, *self.action_space.shape))  # type: ignore[misc]
+        actions: Actions = acted.cpu().numpy().reshape((-1, *acts))
         if isinstance(self.action_space, spaces.Box):
             if self.squash_output:
                 actions = self.unscale_action(actions)
@@ -119,7 +119,8 @@ class Shortcut:
         return self._kept.get(lambda: self._find(root))
 
     def _find(self, root: nn.Module) -> tuple[Paths, list[nn.Module]]:
-        if not _untouched(type(root), ("extract_features",)):
+        kind: Any = type(root)
+        if "extract_features" in vars(root) or not _untouched(kind, ("extract_features",)):
             return [], [root]
         paths = [[root.get_submodule(name) for name in path] for path in self._paths]
         around = [root]
@@ -156,6 +157,6 @@ class Shortcut:
 
 
 @cache
-def _untouched(kind: type, names: tuple[str, ...]) -> bool:
+def _untouched(kind: Any, names: tuple[str, ...]) -> bool:
     """Whether no subclass of the user's own has these methods."""
     return all(getattr(kind, name).__module__.partition(".")[0] in KNOWN for name in names)

@@ -85,7 +85,7 @@ class SparseActorCriticPolicy(SparsePolicyMixin, ActorCriticPolicy):
             return super().get_distribution(obs)
         if isinstance(self.action_dist, DiagGaussianDistribution):
             return self.action_dist.proba_distribution(results[0], self.log_std)
-        return self.action_dist.proba_distribution(action_logits=results[0])  # type: ignore[call-arg]
+        return self.action_dist.proba_distribution(action_logits=results[0])
 
     def predict_values(self, obs: Any) -> th.Tensor:
         """As in SB3, shape ``(n, 1)``."""

@@ -58,7 +58,6 @@ class SparseCriticsMixin(SparsePolicyMixin):
     critic_class: ClassVar[type[PassesGradientsOn]] = SparseContinuousCritic
     actor_kwargs: dict[str, Any]
     critic_kwargs: dict[str, Any]
-    actor: ActingPart
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Any:
         """As in SB3, of :attr:`actor_class`."""
@@ -71,7 +70,12 @@ class SparseCriticsMixin(SparsePolicyMixin):
         return self.critic_class(**kwargs).to(self.device)
 
     def _acts_alone(self) -> bool:
-        return self.actor.acts_alone()
+        return self._acting().acts_alone()
 
     def _quicken(self) -> None:
-        self.actor.quicken()
+        self._acting().quicken()
+
+    def _acting(self) -> ActingPart:
+        actor = self.get_submodule("actor")
+        assert isinstance(actor, ActingPart)
+        return actor

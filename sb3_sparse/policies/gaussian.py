@@ -107,9 +107,8 @@ class GaussianActor(ActingPart):
         super().quicken()
         distribution = vars(self).get("action_dist")
         if type(distribution) is SquashedDiagGaussianDistribution:
-            self.action_dist = QuickSquashedGaussian(
-                distribution.action_dim, distribution.epsilon
-            )
+            quick = QuickSquashedGaussian(distribution.action_dim, distribution.epsilon)
+            vars(self)["action_dist"] = quick
 
     def get_action_dist_params(self, obs: Any) -> tuple[th.Tensor, th.Tensor, dict[str, th.Tensor]]:
         """As in SB3: mean and log standard deviation, shape ``(n, dim)`` each."""

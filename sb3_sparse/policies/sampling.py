@@ -23,14 +23,14 @@ class _MadeLater:
 
     def remember(self, *parameters: th.Tensor) -> None:
         """Be the distribution of these parameters of SB3's ``proba_distribution``."""
-        self._last = parameters
+        self._last = tuple(parameter.detach() for parameter in parameters)
         vars(self).pop("distribution", None)
 
     def __getattr__(self, name: str) -> Any:
         last = vars(self).get("_last")
         if name != "distribution" or last is None:
             raise AttributeError(name)
-        self.proba_distribution(*last)  # type: ignore[attr-defined]
+        self.proba_distribution(*last)
         return vars(self)["distribution"]
 
 

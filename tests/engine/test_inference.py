@@ -212,7 +212,9 @@ def move(net):
     layer = net[0]
     if isinstance(layer, CompactLinear):
         dense = layer.dense()
-        layer.take(Structure.of_mask(dense.numpy() == 0, layer.structure.shape), th.ones_like(dense))
+        layer.take(
+            Structure.of_mask(dense.numpy() == 0, layer.structure.shape), th.ones_like(dense)
+        )
     else:
         mask = MaskedLayer.of(layer)
         mask.set_mask(~mask.mask())
