@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import ctypes
 import struct
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import torch as th
@@ -21,34 +21,12 @@ from sb3_sparse.engine.chains import watched
 from sb3_sparse.engine.linear import CompactLinear
 from sb3_sparse.engine.masked import FLOAT_MASK_KEY, MaskedLayer
 from sb3_sparse.engine.native.library import library, why_missing
+from sb3_sparse.engine.paths import ACTIVATIONS, Paths, modules_of, parts_of
 from sb3_sparse.engine.structure import Structure
 from sb3_sparse.engine.watch import Watch
 
 MOST_INPUTS = 16
 MOST_STEPS = 64
-
-Activation = Callable[[Any], tuple[int, float, float]]
-Paths = Sequence[Sequence[nn.Module]]
-"""Modules of each network in the order of computation."""
-OWN = ("torch.nn.", "sb3_sparse.engine.")
-"""Where a ``Sequential`` that calls its parts in turn is defined; one of the user's may do more."""
-ACTIVATIONS: dict[type[nn.Module], Activation] = {
-    nn.ReLU: lambda _: (1, 0.0, 0.0),
-    nn.Tanh: lambda _: (2, 0.0, 0.0),
-    nn.Sigmoid: lambda _: (3, 0.0, 0.0),
-    nn.ELU: lambda m: (4, m.alpha, 0.0),
-    nn.CELU: lambda m: (5, m.alpha, 0.0),
-    nn.SELU: lambda _: (6, 0.0, 0.0),
-    nn.GELU: lambda m: (7 if m.approximate == "none" else 8, 0.0, 0.0),
-    nn.SiLU: lambda _: (9, 0.0, 0.0),
-    nn.Mish: lambda _: (10, 0.0, 0.0),
-    nn.Softplus: lambda m: (11, m.beta, m.threshold),
-    nn.LeakyReLU: lambda m: (12, m.negative_slope, 0.0),
-    nn.ReLU6: lambda _: (13, 0.0, 6.0),
-    nn.Hardtanh: lambda m: (13, m.min_val, m.max_val),
-    nn.Hardswish: lambda _: (14, 0.0, 0.0),
-}
-"""Number and parameters of an activation in ``kernels.h``."""
 
 
 class Step(NamedTuple):
@@ -122,7 +100,7 @@ class Inference:
         places: dict[tuple[int, ...], int] = {}
         ends = []
         for path in paths:
-            parts = _parts(path)
+            parts = parts_of(path)
             if not parts:
                 return None
             key: tuple[int, ...] = ()
@@ -228,34 +206,6 @@ class Inference:
         return (ctypes.c_int64 * len(fields))(*fields)
 
 
-def _parts(path: Iterable[nn.Module]) -> list[tuple[nn.Linear, nn.Module | None]] | None:
-    """Layers, each with its activation; None if there is anything else."""
-    parts: list[tuple[nn.Linear, nn.Module | None]] = []
-    for module in _leaves(path):
-        if type(module) in (nn.Linear, CompactLinear):
-            assert isinstance(module, nn.Linear)
-            parts.append((module, None))
-        elif type(module) in ACTIVATIONS and parts and parts[-1][1] is None:
-            parts[-1] = (parts[-1][0], module)
-        elif type(module) is not nn.Identity:
-            return None
-    return parts
-
-
-def _leaves(path: Iterable[nn.Module]) -> Iterable[nn.Module]:
-    for module in path:
-        if isinstance(module, nn.Sequential) and type(module).__module__.startswith(OWN):
-            yield from _leaves(module)
-        else:
-            yield module
-
-
-def modules_of(paths: Paths) -> list[nn.Module]:
-    """Every module on the paths, once."""
-    found = (inner for path in paths for module in path for inner in module.modules())
-    return list({id(module): module for module in found}.values())
-
-
 def _readable(tensor: th.Tensor) -> bool:
     return tensor.dtype == th.float32 and tensor.is_cpu and tensor.is_contiguous()
 
@@ -290,27 +240,3 @@ class KeptInference:
             self._watch = Watch([*around, *modules_of(paths)])
             self._inference = Inference.of(paths, around[1:])
         return self._inference
-
-
-def gaussian(
-    mean: th.Tensor, log_std: th.Tensor, noise: th.Tensor | None, result: th.Tensor
-) -> bool:
-    """Actions of Gaussians and their log probabilities; whether one is not finite.
-
-    :param mean: shape ``(n, dim)``; float32 on the CPU and contiguous, as all
-    :param log_std: shape ``(dim,)``
-    :param noise: of a standard normal distribution, shape ``(n, dim)``; None: the mean acts
-    :param result: shape ``(n * dim + n,)``: room for the actions, then for the log probabilities
-    """
-    n, size = mean.shape
-    at = result.data_ptr()
-    failed: int = library().sb3_sparse_gaussian(
-        n,
-        size,
-        mean.data_ptr(),
-        log_std.data_ptr(),
-        None if noise is None else noise.data_ptr(),
-        at,
-        at + 4 * n * size,
-    )
-    return bool(failed)

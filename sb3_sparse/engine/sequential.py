@@ -10,8 +10,9 @@ from torch import nn
 from torch.nn.modules.module import _has_any_global_hook
 
 from sb3_sparse.engine.chains import Chain, watched
-from sb3_sparse.engine.inference import ACTIVATIONS, KeptInference
+from sb3_sparse.engine.inference import KeptInference
 from sb3_sparse.engine.linear import CompactLinear
+from sb3_sparse.engine.paths import ACTIVATIONS
 
 ELEMENTWISE = (*ACTIVATIONS, nn.Identity)
 """Activations that may work on tiles as they are."""

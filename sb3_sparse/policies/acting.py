@@ -15,7 +15,8 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, Flatten
 from torch import nn
 
 from sb3_sparse.engine.chains import watched
-from sb3_sparse.engine.inference import MOST_INPUTS, Inference, KeptInference, Paths
+from sb3_sparse.engine.inference import MOST_INPUTS, Inference, KeptInference
+from sb3_sparse.engine.paths import Paths
 from sb3_sparse.policies.modes import Modes
 from sb3_sparse.policies.storage import KNOWN
 

@@ -13,7 +13,8 @@ from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtr
 
 from sb3_sparse.errors import UnsupportedError
 from sb3_sparse.policies.acting import Shortcut
-from sb3_sparse.policies.mixin import SparsePolicyMixin, with_extractor
+from sb3_sparse.policies.extractors import with_extractor
+from sb3_sparse.policies.mixin import SparsePolicyMixin
 from sb3_sparse.policies.sampling import QuickCategorical, QuickGaussian, quick
 from sb3_sparse.policies.spec import NetworkSpec
 

@@ -8,7 +8,8 @@ import torch as th
 from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, NatureCNN
 from stable_baselines3.dqn.policies import DQNPolicy, QNetwork
 
-from sb3_sparse.policies.mixin import SparsePolicyMixin, with_extractor
+from sb3_sparse.policies.extractors import with_extractor
+from sb3_sparse.policies.mixin import SparsePolicyMixin
 from sb3_sparse.policies.parts import ActingPart
 from sb3_sparse.policies.spec import NetworkSpec
 

@@ -286,20 +286,3 @@ class SparsePolicyMixin(Acts):
         if hasattr(self, "share_features_extractor"):  # SB3 forgets it for some of its policies
             data["share_features_extractor"] = self.share_features_extractor
         return data
-
-
-def with_extractor(
-    policy: type[Sparse], prefix: str, extractor: type[BaseFeaturesExtractor]
-) -> type[Sparse]:
-    """A subclass of ``policy`` with another default features extractor.
-
-    :param prefix: what to put between the class name and ``Policy``, e.g. ``"Cnn"``; the module
-        must bind the class to that name, or it cannot be pickled
-    """
-    name = policy.__name__.removesuffix("Policy") + prefix + "Policy"
-    members = {
-        "__module__": policy.__module__,
-        "__doc__": f"{policy.__name__} with {extractor.__name__} by default.",
-        "extractor_class": extractor,
-    }
-    return type(name, (policy,), members)

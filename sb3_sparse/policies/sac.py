@@ -7,7 +7,7 @@ from stable_baselines3.sac.policies import Actor, SACPolicy
 
 from sb3_sparse.policies.critics import SparseCriticsMixin
 from sb3_sparse.policies.gaussian import GaussianActor
-from sb3_sparse.policies.mixin import with_extractor
+from sb3_sparse.policies.extractors import with_extractor
 from sb3_sparse.policies.spec import NetworkSpec
 
 GAUSSIAN_ACTOR = NetworkSpec(

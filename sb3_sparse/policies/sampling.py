@@ -11,7 +11,7 @@ from stable_baselines3.common.distributions import (
     Distribution,
 )
 
-from sb3_sparse.engine.inference import gaussian
+from sb3_sparse.engine.gaussian import gaussian
 
 
 class _MadeLater:

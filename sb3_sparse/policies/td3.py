@@ -9,7 +9,7 @@ from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtr
 from stable_baselines3.td3.policies import Actor, TD3Policy
 
 from sb3_sparse.policies.critics import SparseCriticsMixin
-from sb3_sparse.policies.mixin import with_extractor
+from sb3_sparse.policies.extractors import with_extractor
 from sb3_sparse.policies.parts import ActingPart
 from sb3_sparse.policies.sac import TWIN_CRITIC
 from sb3_sparse.policies.spec import NetworkSpec
