@@ -12,8 +12,8 @@ from stable_baselines3.common.type_aliases import Schedule
 
 from sb3_sparse.errors import MissingExtra
 from sb3_sparse.policies.critics import PassesGradientsOn, SparseCriticsMixin
-from sb3_sparse.policies.gaussian import GaussianActor
 from sb3_sparse.policies.extractors import with_extractor
+from sb3_sparse.policies.gaussian import GaussianActor
 from sb3_sparse.policies.mixin import SparsePolicyMixin
 from sb3_sparse.policies.parts import ActingPart
 from sb3_sparse.policies.sac import GAUSSIAN_ACTOR, TWIN_CRITIC

@@ -6,8 +6,8 @@ from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtr
 from stable_baselines3.sac.policies import Actor, SACPolicy
 
 from sb3_sparse.policies.critics import SparseCriticsMixin
-from sb3_sparse.policies.gaussian import GaussianActor
 from sb3_sparse.policies.extractors import with_extractor
+from sb3_sparse.policies.gaussian import GaussianActor
 from sb3_sparse.policies.spec import NetworkSpec
 
 GAUSSIAN_ACTOR = NetworkSpec(
