@@ -62,9 +62,10 @@ def run_study(
 ) -> Generator[Progress, None, None]:
     """Bring every cell of a study to its end; yields how far it is, about once a second.
 
-    A cell that is done or diverged is not run again, an interrupted one goes on, one that fails is
-    tried a second time after all others. Closing the iterator stops the cells that are running at
-    their next rollout; the next call goes on with them.
+    Cells are begun in the study's order, first seeds first. A cell that is done or diverged is not
+    run again, an interrupted one goes on, one that fails is tried a second time after all others.
+    Closing the iterator stops the cells that are running at their next rollout; the next call goes
+    on with them.
 
     :param study: what to run
     :param store: folder of the studies' runs, which studies share
@@ -82,9 +83,10 @@ def run_study(
     progress = Progress(len(study.cells), done=len(over) - diverged, diverged=diverged)
     cells = [one.cell for one in standings if one.status not in (DONE, DIVERGED)]
     yield progress
-    again: list[Cell] = []
+    again: set[str] = set()
     for attempt in (1, 2):
-        tasks = [_task(cell, store) for cell in (cells if attempt == 1 else again)]
+        now = cells if attempt == 1 else [cell for cell in cells if cell.address in again]
+        tasks = [_task(cell, store) for cell in now]
         left = len(tasks)
         if not tasks:
             return
@@ -94,7 +96,7 @@ def run_study(
                 left -= 1
                 cell = ended.task.arguments["cell"]
                 if ended.error is not None and attempt == 1:
-                    again.append(cell)
+                    again.add(cell.address)
                     progress.retried.append(cell.name)
                 _account(progress, cell, store, ended, last=attempt == 2)
                 if ended.value in (DONE, DIVERGED):

@@ -1,4 +1,7 @@
-"""Bringing one cell to its end, in a process of its own."""
+"""Bringing one cell to its end, in a process of its own.
+
+What training needs is imported at the top: once for all cells (:mod:`sb3_sparse.launch.local`).
+"""
 
 from __future__ import annotations
 
@@ -8,14 +11,18 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import torch._dynamo  # noqa: F401 by the first optimizer that is made, in a second
+
 from sb3_sparse.errors import ConfigError, Diverged, RunBusy
 from sb3_sparse.experiments.cell import Cell
 from sb3_sparse.experiments.measures import FILES
 from sb3_sparse.experiments.standing import DONE, OVER, RUNNING, STOPPED, standing_of
 from sb3_sparse.zoo.checkpoint import LOCK, locked
 from sb3_sparse.zoo.prepare import count
+from sb3_sparse.zoo.progress import TrainingProgress
 from sb3_sparse.zoo.record import DIVERGED, NAME, read_record, write_record
 from sb3_sparse.zoo.run import Run
+from sb3_sparse.zoo.train import resume, train
 
 
 def work_on(cell: Cell, store: Path) -> str:
@@ -60,9 +67,6 @@ def _trained(folder: Path) -> bool:
 
 def _train(cell: Cell, folder: Path) -> bool:
     """Train to the end; whether it was reached."""
-    from sb3_sparse.zoo.progress import TrainingProgress
-    from sb3_sparse.zoo.train import resume, train  # rl_zoo3 takes its time to import
-
     callbacks = cell.measures.callbacks(folder)
     watch = TrainingProgress()  # into the cell's log
     try:

@@ -21,8 +21,8 @@ class Task:
     """A call to be made in a process of its own.
 
     :param name: for messages
-    :param function: ``"package.module:name"`` of what is called; a path, so that the process can
-        set its number of threads before it imports anything
+    :param function: ``"package.module:name"`` of what is called; a path, so that the number of
+        threads is set before anything is imported
     :param arguments: its keyword arguments; must pickle
     :param log: file that the process's output is appended to; None: dropped
     """

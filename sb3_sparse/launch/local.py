@@ -9,18 +9,24 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Generator, Sequence
-from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
+from contextlib import suppress
 from pathlib import Path
-from threading import Event, Lock
+from queue import Empty, Queue
+from threading import Thread
+from typing import IO
 
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.launch.base import EVERY, Ended, Launcher, Task, check_workers
+from sb3_sparse.launch.jobs import Job, Plan
 
 SHOWN_LINES = 15
 
 
 class LocalLauncher(Launcher):
-    """Each task in a new Python process with one thread; a thread of ours waits for each.
+    """Each task in a process of its own with one thread.
+
+    One process imports the modules of all tasks, and forks for each of them: a task begins within
+    a moment. The modules must start no threads when they are imported.
 
     :param address: must be None
     """
@@ -34,70 +40,86 @@ class LocalLauncher(Launcher):
     def run(self, tasks: Sequence[Task], workers: int) -> Generator[Ended | None, None, None]:
         """See :meth:`Launcher.run`."""
         check_workers(workers)
-        processes = _Processes()
-        with ThreadPoolExecutor(workers) as pool:
-            left = {pool.submit(processes.run, task) for task in tasks}
-            try:
-                while left:
-                    done, left = wait(left, timeout=EVERY, return_when=FIRST_COMPLETED)
-                    for future in done:
-                        yield future.result()
-                    if not done:
+        with tempfile.TemporaryDirectory() as name:
+            jobs = [_job(Path(name) / str(number), task) for number, task in enumerate(tasks)]
+            modules = dict.fromkeys(task.function.partition(":")[0] for task in tasks)
+            output = Path(name) / "server"
+            with _Server(Plan(sys.path, list(modules), jobs, workers), output) as server:
+                waiting = dict(enumerate(tasks))
+                while waiting:
+                    try:
+                        answer = server.answers.get(timeout=EVERY)
+                    except Empty:
                         yield None
-            finally:
-                processes.stop()
-                pool.shutdown(cancel_futures=True)
+                        continue
+                    if answer is None:
+                        break
+                    number, code = map(int, answer.split())
+                    yield _ended(waiting.pop(number), jobs[number], code)
+            for task in waiting.values():  # nobody will run them
+                yield Ended(task, error=_error(server.process.returncode, output))
 
 
-class _Processes:
-    """The processes that are alive, so that all can be stopped."""
+class _Server:
+    """The process that forks, while the context lasts.
 
-    def __init__(self) -> None:
-        self.alive: set[subprocess.Popen[bytes]] = set()
-        self.lock = Lock()
-        self.stopped = Event()
+    :param plan: what it does
+    :param output: file of what it prints, other than its answers
+    """
 
-    def run(self, task: Task) -> Ended:
-        with tempfile.TemporaryDirectory() as folder:
-            answer, log = Path(folder) / "answer", task.log or Path(folder) / "log"
-            log.parent.mkdir(parents=True, exist_ok=True)
-            with log.open("ab") as output:
-                with self.lock:
-                    if self.stopped.is_set():
-                        return Ended(task, error="not started")
-                    process = subprocess.Popen(
-                        [sys.executable, "-m", "sb3_sparse.launch.child", str(answer)],
-                        stdin=subprocess.PIPE,
-                        stdout=output,
-                        stderr=subprocess.STDOUT,
-                        env={**os.environ, "OMP_NUM_THREADS": "1"},
-                    )
-                    self.alive.add(process)
-                try:
-                    return self._talk(process, task, answer, log)
-                finally:
-                    with self.lock:
-                        self.alive.discard(process)
+    def __init__(self, plan: Plan, output: Path) -> None:
+        self.plan = plan
+        self.output = output
+        self.answers: Queue[str | None] = Queue()
 
-    def _talk(self, process: subprocess.Popen[bytes], task: Task, answer: Path, log: Path) -> Ended:
-        assert process.stdin is not None
-        try:
-            process.stdin.write(pickle.dumps(task.packed()))
-            process.stdin.write(b"\n")
-            process.stdin.flush()  # and stays open: its end tells the child that we are gone
-        except BrokenPipeError:
-            pass  # the exit code says more
-        code = process.wait()
-        process.stdin.close()
-        if answer.is_file():
-            value, error = pickle.loads(answer.read_bytes())
-            return Ended(task, value, error)
-        lines = log.read_text(errors="replace").splitlines()[-SHOWN_LINES:]
-        how = f"was killed by {signal.Signals(-code).name}" if code < 0 else f"exited with {code}"
-        return Ended(task, error="\n".join([f"its process {how}", *(lines if code > 0 else [])]))
+    def __enter__(self) -> _Server:
+        with self.output.open("wb") as output:
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "sb3_sparse.launch.server"],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=output,
+                env={**os.environ, "OMP_NUM_THREADS": "1"},
+            )
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        self.reader = Thread(target=_read, args=(self.process.stdout, self.answers), daemon=True)
+        self.reader.start()
+        with suppress(BrokenPipeError):  # the exit code says more
+            self.process.stdin.write(pickle.dumps(self.plan))
+            self.process.stdin.flush()  # and stays open: its end stops all tasks
+        return self
 
-    def stop(self) -> None:
-        with self.lock:
-            self.stopped.set()
-            for process in self.alive:
-                process.terminate()
+    def __exit__(self, *_: object) -> None:
+        assert self.process.stdin is not None
+        with suppress(BrokenPipeError):
+            self.process.stdin.close()
+        self.process.wait()
+        self.reader.join()
+
+
+def _read(lines: IO[bytes], into: Queue[str | None]) -> None:
+    with lines:
+        for line in lines:
+            into.put(line.decode())
+    into.put(None)
+
+
+def _job(files: Path, task: Task) -> Job:
+    log = files.with_suffix(".log") if task.log is None else task.log
+    log.parent.mkdir(parents=True, exist_ok=True)
+    return Job(task.packed(), log.absolute(), files.with_suffix(".answer"))
+
+
+def _ended(task: Task, job: Job, code: int) -> Ended:
+    if job.answer.is_file():
+        value, error = pickle.loads(job.answer.read_bytes())
+        return Ended(task, value, error)
+    return Ended(task, error=_error(code, job.log))
+
+
+def _error(code: int, log: Path) -> str:
+    """What to say of a process that ended before its task did."""
+    how = f"was killed by {signal.Signals(-code).name}" if code < 0 else f"exited with {code}"
+    lines = log.read_text(errors="replace").splitlines()[-SHOWN_LINES:]
+    return "\n".join([f"its process {how}", *(lines if code > 0 else [])])

@@ -12,7 +12,7 @@ import zipfile
 import pytest
 import torch as th
 from stable_baselines3.common.vec_env import DummyVecEnv
-from study_support import RUNS, Here, finish, study
+from study_support import QUICK, RUNS, Here, finish, study
 
 from sb3_sparse.experiments import run_study, standing_of
 from sb3_sparse.experiments.noise import noisy_envs
@@ -82,6 +82,23 @@ def test_a_failed_cell_is_tried_once_more_after_the_others(tmp_path):
     assert launcher.called == [names[0], names[1], names[0]]
     assert (last.done, last.failed, last.retried) == (2, {}, [names[0]])
     assert not made.cells[0].errors(tmp_path / "store").exists()
+
+
+class Backwards(Here):
+    """Runs the tasks in their order, and tells their ends as slow first ones come out."""
+
+    def run(self, tasks, workers):
+        yield from reversed(list(super().run(tasks, workers)))
+
+
+def test_cells_are_run_seed_by_seed_also_when_they_are_tried_again(tmp_path):
+    scales = {"smoke": {**QUICK, "seeds": 2, "env_id": ["CartPole-v1", "Acrobot-v1"]}}
+    made = study(tmp_path, trained=False, scales=scales)
+    names = [cell.name for cell in made.cells]
+    assert [name.endswith("seed 1") for name in names] == [False] * 4 + [True] * 4
+    launcher = Backwards(dict.fromkeys([names[1], names[2], names[5]], 1))
+    assert finish(made, tmp_path / "store", launcher).done == 8
+    assert launcher.called == [*names, names[1], names[2], names[5]]
 
 
 def test_a_cell_that_fails_twice_is_reported_with_its_traceback_and_the_others_go_on(tmp_path):

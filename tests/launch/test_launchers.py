@@ -12,7 +12,9 @@ from contextlib import closing
 import pytest
 
 from sb3_sparse.errors import ConfigError, MissingExtra
+from sb3_sparse.experiments import runner
 from sb3_sparse.launch import Task, launcher_named, launcher_names
+from sb3_sparse.tuning import search
 
 NAMES = launcher_names()
 
@@ -48,6 +50,102 @@ def test_tasks_find_modules_where_this_process_finds_them(launcher, tmp_path, mo
     monkeypatch.syspath_prepend(tmp_path)
     (end,) = ended(launcher, [Task("here", "only_here:answer", {})])
     assert (end.value, end.error) == (42, None)
+
+
+def test_modules_are_imported_once_for_all_local_tasks_and_chance_is_their_own(
+    tmp_path, monkeypatch
+):
+    (tmp_path / "slow_module.py").write_text(
+        "import os, random, numpy\n"
+        "print('imported')\n"
+        "importer = os.getpid()\n"
+        "def look():\n"
+        "    return importer, os.getppid(), random.random(), numpy.random.random()\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    tasks = [Task(str(n), "slow_module:look", {}, tmp_path / f"{n}.log") for n in range(3)]
+    seen = [end.value for end in ended(launcher_named("local"), tasks)]
+    (importer,) = {one[0] for one in seen}
+    assert {one[1] for one in seen} == {importer}
+    assert importer != os.getpid()
+    assert len({one[2] for one in seen}) == len({one[3] for one in seen}) == 3
+    assert [task.log.read_text() for task in tasks] == [""] * 3
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="counts threads as Linux shows them")
+@pytest.mark.parametrize("function", [runner.FUNCTION, search.WORK])
+def test_modules_of_our_tasks_start_no_thread_that_a_fork_would_lose(function):
+    code = (
+        f"import {function.partition(':')[0]}, os, torch\n"
+        "print(len(os.listdir('/proc/self/task')), torch.cuda.is_initialized())"
+    )
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True
+    )
+    assert done.stdout == "1 False\n", done.stderr
+
+
+def test_a_module_that_cannot_be_imported_fails_its_own_task_alone(launcher):
+    tasks = [Task("lost", "no_such_module:f", {}), Task("fine", "os:getpid", {})]
+    ends = {end.task.name: end for end in ended(launcher, tasks)}
+    assert "No module named 'no_such_module'" in ends["lost"].error
+    assert ends["fine"].error is None
+
+
+def test_a_module_that_ends_the_process_that_imports_it_is_told(tmp_path, monkeypatch):
+    (tmp_path / "exits.py").write_text("import sys\nprint('so it is')\nsys.exit(4)\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    (end,) = ended(launcher_named("local"), [Task("exits", "exits:f", {})])
+    assert end.error == "its process exited with 4\nso it is"
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="Linux numbers processes as they begin")
+def test_tasks_begin_in_their_order_with_several_workers_too():
+    tasks = [Task(str(n), "os:getpid", {}) for n in range(6)]
+    values = {int(end.task.name): end.value for end in ended(launcher_named("local"), tasks)}
+    processes = [values[n] for n in range(6)]
+    assert processes == sorted(processes)
+
+
+def test_ctrl_c_of_a_terminal_reaches_a_task_once_and_kills_nothing_else(tmp_path):
+    """A terminal sends it to the whole group of processes."""
+    (tmp_path / "patient.py").write_text(
+        "import os, time\n"
+        "def sit(noted):\n"
+        "    try:\n"
+        "        print(os.getpgid(0), file=(file := open(noted, 'w')), end='', flush=True)\n"
+        "        time.sleep(60)\n"
+        "    except KeyboardInterrupt:\n"
+        "        time.sleep(0.5)\n"
+        "        open(noted, 'a').write(' stopped')\n"
+    )
+    noted = tmp_path / "noted"
+    code = (
+        "from sb3_sparse.launch import Task, launcher_named\n"
+        f"task = Task('t', 'patient:sit', {{'noted': {str(noted)!r}}})\n"
+        "endings = launcher_named('local').run([task], 1)\n"
+        "try:\n"
+        "    list(endings)\n"
+        "except KeyboardInterrupt:\n"
+        "    endings.close()\n"
+        "    print('closed')\n"
+    )
+    parent = subprocess.Popen(
+        [sys.executable, "-c", code],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])},
+        stdout=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    while not (noted.exists() and noted.read_text()):
+        time.sleep(0.1)
+        assert parent.poll() is None
+    assert int(noted.read_text()) == parent.pid
+    os.killpg(parent.pid, signal.SIGINT)
+    assert parent.communicate(timeout=30)[0] == "closed\n"
+    assert noted.read_text() == f"{parent.pid} stopped"
 
 
 def test_a_killed_process_takes_no_other_task_with_it(launcher):
