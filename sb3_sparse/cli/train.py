@@ -106,7 +106,7 @@ def train(
         if progress.folder is None:
             console.print("Interrupted before the run had begun; nothing is left of it.")
         else:
-            console.print("Interrupted. Go on from the last evaluation with:")
+            console.print("Interrupted. Go on from the last checkpoint with:")
             console.print(command("train", "--resume", progress.folder), soft_wrap=True)
         raise typer.Exit(INTERRUPTED) from None
     finally:

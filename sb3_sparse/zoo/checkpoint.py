@@ -7,6 +7,7 @@ import shutil
 import signal
 import sys
 import threading
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -27,6 +28,7 @@ FOLDER = "resume"
 REPLAY_BUFFER = "replay_buffer"
 MONITOR = ".monitor.csv"
 LOCK = ".lock"
+SECONDS = 120.0  # of training, that a kill may cost where evaluations are far apart
 PATIENCE = 1.0  # seconds; others hold the lock for a moment to see whether it is free
 
 
@@ -35,7 +37,7 @@ class StopTraining(Exception):
 
 
 class Checkpoints(BaseCallback):
-    """Saves everything after each evaluation, and stops cleanly when asked.
+    """Saves everything after each evaluation and every two minutes, and stops cleanly when asked.
 
     Saves at the start of a rollout, when all experience has been learnt from. A checkpoint is a
     folder ``resume/<steps>``; it appears whole or not at all, and then the one before goes. Model
@@ -58,13 +60,14 @@ class Checkpoints(BaseCallback):
         if isinstance(self.model, OffPolicyAlgorithm):
             assert self.model.replay_buffer is not None
             self.buffer = BufferSaver(self.model.replay_buffer)
-        self.saved_evaluations = self.evaluation.count
+        self.saved_evaluations, self.saved_at = self.evaluation.count, time.monotonic()
 
     def _on_rollout_start(self) -> None:
         evaluated = self.evaluation.count > self.saved_evaluations
-        if evaluated or self.stop_wanted:
+        late = time.monotonic() > self.saved_at + SECONDS
+        if evaluated or late or self.stop_wanted:
             self.save()
-            self.saved_evaluations = self.evaluation.count
+            self.saved_evaluations, self.saved_at = self.evaluation.count, time.monotonic()
         if self.stop_wanted:
             raise StopTraining
 
@@ -118,12 +121,14 @@ class Checkpoints(BaseCallback):
             return
 
         def ask(number: int, frame: FrameType | None) -> None:
-            if self.stop_wanted and number == signal.SIGINT:
-                raise KeyboardInterrupt
+            if self.stop_wanted:
+                if number == signal.SIGINT:
+                    raise KeyboardInterrupt
+                return  # SIGTERM, which a launcher sends after a terminal's Ctrl-C
             self.stop_wanted = True
             print(
                 "\nStopping as soon as this rollout has been learnt from; Ctrl-C again stops at "
-                "once and falls back to the last evaluation",
+                "once and falls back to the last checkpoint",
                 file=sys.stderr,
             )
 

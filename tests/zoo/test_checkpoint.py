@@ -7,10 +7,12 @@ import signal
 from pathlib import Path
 from threading import Event, Thread
 
+import numpy as np
 import pytest
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_sparse.errors import ConfigError, RunBusy, SparsityError
+from sb3_sparse.zoo import checkpoint
 from sb3_sparse.zoo.checkpoint import is_locked, last_checkpoint, locked
 from sb3_sparse.zoo.record import read_record
 from sb3_sparse.zoo.run import Run
@@ -37,6 +39,40 @@ class Stop(BaseCallback):
 def stopped(tmp_path_factory):
     """Folder of a run that was stopped after 500 steps."""
     return train(RUN, tmp_path_factory.mktemp("logs"), [Stop()]).folder
+
+
+class Killed(BaseCallback):
+    """What a kill does after 150 steps; and which checkpoints there were until then."""
+
+    def __init__(self, root: Path) -> None:
+        super().__init__()
+        self.root = root
+        self.seen: set[int | None] = set()
+
+    def _on_step(self) -> bool:
+        (folder,) = self.root.glob("dqn/*")
+        found = last_checkpoint(folder)
+        self.seen.add(None if found is None else int(found.name))
+        if self.num_timesteps == 150:
+            raise OSError("killed")
+        return True
+
+
+@pytest.mark.parametrize(("seconds", "saved"), [(0.0, 149), (120.0, None)])
+def test_a_kill_before_the_first_evaluation_costs_two_minutes_at_most(
+    tmp_path, monkeypatch, seconds, saved
+):
+    monkeypatch.setattr(checkpoint, "SECONDS", seconds)
+    killed = Killed(tmp_path)
+    with pytest.raises(OSError, match="killed"):
+        train(RUN, tmp_path, [killed])
+    (folder,) = (tmp_path / "dqn").iterdir()
+    found = last_checkpoint(folder)
+    assert (None if found is None else int(found.name)) == saved
+    assert len(killed.seen) == (150 if saved else 1)
+    assert resume(folder).finished
+    evaluations = np.load(folder / "evaluations.npz")
+    assert evaluations["timesteps"].tolist() == [200, 400, 600, 800]
 
 
 @pytest.fixture
