@@ -93,7 +93,8 @@ class Controller:
 
     def _attach_to_gradients(self) -> bool:
         """Register the hooks on gradients alone; whether they were missing."""
-        weights = [layer.weight for layer in self.layers if not layer.frozen]
+        layers = chain.from_iterable(network.sparse_layers for network in self.networks)
+        weights = [layer.weight for layer in layers if not layer.frozen]
         return self._gradient_hooks.attach(weights, self._hook_gradients)
 
     def _hook_gradients(self) -> list[RemovableHandle]:
@@ -101,7 +102,7 @@ class Controller:
         self._gradient_masks = {
             layer.name: layer.gradient_mask(functional, partial(self._capturing, network))
             for network in self.networks
-            for layer in network.layers
+            for layer in network.sparse_layers
             if not layer.frozen
         }
         return [mask.attach() for mask in self._gradient_masks.values()]
@@ -141,8 +142,8 @@ class Controller:
 
         :param root: the policy
         """
-        auto, layers = self._auto, list(self.layers)
-        if auto and (chosen := auto.choose(root, layers, self.optimizers)):
+        auto = self._auto
+        if auto and (chosen := auto.choose(root, list(self.layers), self.optimizers)):
             self.compact(root, chosen)
 
     def expand(self, root: nn.Module) -> None:
@@ -168,24 +169,23 @@ class Controller:
         """Start a round of gradient steps of the policy ``root``: hooks on, nothing outdated."""
         self.attach()
         self.choose_storage(root)
-        if self.plan is not None and not self._in_force():
+        if not self._in_force():
             self.plan = None  # of a training that was interrupted
         for mask in self._gradient_masks.values():
             mask.dense_grad = None
-        self.enforce()
-        for layer in self.layers:
-            layer.settle_targets(self.soft_targets)
+        for network in self.networks:
+            network.settle(self.soft_targets)
 
     def enforce(self) -> None:
         """Set to 0 what masks have inactive, whoever wrote it."""
-        for layer in self.layers:
-            layer.remask()
+        for network in self.networks:
+            network.remask()
 
     def start(self, plan: Plan, soft_targets: bool, in_force: Callable[[], bool]) -> None:
         """Let masks move from now on.
 
-        :param soft_targets: whether targets follow the mask at once (Polyak averaging) or keep
-            their snapshot until the next hard copy
+        :param soft_targets: whether targets follow the mask at once (Polyak averaging), or at the
+            next hard copy
         :param in_force: whether the training that the plan was made for still goes on
         """
         self.plan = plan
@@ -233,7 +233,7 @@ class Controller:
             if self.plan is None and not self._warned and network.denser:
                 self._warned = True
                 warn_of_no_plan(self.sparsity)
-            for layer in network.layers:
+            for layer in network.sparse_layers:
                 layer.mask_gradient()  # others may have written it after our hooks
             if self.plan is not None:
                 self._update_if_due(network, self.plan)
@@ -244,8 +244,7 @@ class Controller:
         """Of optimizers that write to what is inactive."""
         for network in self.networks:
             if network.optimizer is optimizer:
-                for layer in network.layers:
-                    layer.remask()
+                network.remask()
 
     def _update_if_due(self, network: SparseNetwork, plan: Plan) -> None:
         gradients = network.take_gradients(self._gradient_masks)

@@ -52,6 +52,11 @@ class SparseLayer(ABC):
         return self.nnz == self.size
 
     @property
+    def always_full(self) -> bool:
+        """Whether every connection is active, and stays so."""
+        return self.nnz == self.size == self.final_nnz
+
+    @property
     def frozen(self) -> bool:
         """Whether the weight is not trained, so that its connections stay where they are."""
         return not self.weight.requires_grad

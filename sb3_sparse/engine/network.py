@@ -60,6 +60,25 @@ class SparseNetwork:
         return [*(layer.weight for layer in self.layers), *dense]
 
     @property
+    def sparse_layers(self) -> list[SparseLayer]:
+        """Those with connections that are inactive, or may become so."""
+        return [layer for layer in self.layers if not layer.always_full]
+
+    def remask(self) -> None:
+        """Set to 0 what masks have inactive."""
+        for layer in self.sparse_layers:
+            layer.remask()
+
+    def settle(self, soft_targets: bool) -> None:
+        """Bring weights and targets in line with the masks before a round of training.
+
+        :param soft_targets: whether targets follow a mask at once
+        """
+        for layer in self.sparse_layers:
+            layer.remask()
+            layer.settle_targets(soft_targets)
+
+    @property
     def size(self) -> int:
         """Connections of the dense network, within the budget."""
         return sum(layer.size for layer in self.layers)

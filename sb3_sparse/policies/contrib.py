@@ -106,10 +106,11 @@ class SoundBatchRenorm1d(BatchRenorm1d):
 
     def forward(self, x: th.Tensor) -> th.Tensor:
         """As in sb3-contrib, shape ``(batch, features)``."""
-        if self.training and x.requires_grad:
-            x = x.view_as(x)
+        if self.training and x.requires_grad and self.steps > self.warmup_steps:  # type: ignore[operator]
             constant = x.detach().var(dim=0) == 0
-            x.register_hook(partial(_zero_where, constant))  # type: ignore[no-untyped-call]
+            if constant.any():
+                x = x.view_as(x)
+                x.register_hook(partial(_zero_where, constant))  # type: ignore[no-untyped-call]
         result: th.Tensor = super().forward(x)
         return result
 

@@ -271,11 +271,11 @@ def test_weight_decay_is_coupled_added_after_clipping_and_on_kernels_only(compac
     owner.optimizer = th.optim.SGD(owner.parameters(), lr=1.0)
     network = SparseNetwork("net", owner, [("0", owner[0])])
     controller = Controller([network], 1, functional_gradients=False, weight_decay=0.25)
-    controller.attach()
     with th.no_grad():
         owner[0].weight.fill_(2.0)
         owner[0].bias.fill_(2.0)
     network.layers[0].set_mask(np.tile([True, False], 6))
+    controller.attach()
     if compact:
         controller.compact(owner)
     (owner[0].weight.sum() + owner[0].bias.sum()).backward()
