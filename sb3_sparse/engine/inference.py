@@ -117,6 +117,11 @@ class Inference:
             return None
         return cls(steps, ends, modules)
 
+    @property
+    def on_cpu(self) -> bool:
+        """Whether its tensors are where the kernels can read them."""
+        return self._tensors[0].is_cpu
+
     def __call__(self, x: th.Tensor) -> list[th.Tensor] | None:
         """Each network's result, shape ``(n, its outputs)``, without a graph.
 
@@ -126,12 +131,20 @@ class Inference:
 
         :param x: shape ``(n, features)``
         """
-        if watched(x):
+        if watched(x) or not 0 < x.shape[0] <= MOST_INPUTS:
             return None
+        results = self._results(x)
+        if results is None:
+            # Let the modules compute what the kernels would: without what is inactive.
+            for layer in self._layers:
+                if (masked := MaskedLayer.of(layer)) is not None:
+                    masked.remask()
+        return results
+
+    def _results(self, x: th.Tensor) -> list[th.Tensor] | None:
         n, *features = x.shape
         if (
-            not 0 < n <= MOST_INPUTS
-            or features != [self._columns]
+            features != [self._columns]
             or x.dtype is not th.float32
             or not x.is_cpu
             or any(self._hooks)
@@ -146,7 +159,6 @@ class Inference:
             x = x.contiguous().resolve_neg()
         y = th.empty(n * self._total, dtype=th.float32, device="cpu")
         if self._call(binding.arguments, len(self._steps), n, x.data_ptr(), y.data_ptr()):
-            self._remask()
             return None
         if len(self._widths) == 1:
             return [y.view(n, self._total)]
@@ -154,12 +166,6 @@ class Inference:
             y.as_strided((n, width), (width, 1), n * place)
             for width, place in zip(self._widths, self._places, strict=True)
         ]
-
-    def _remask(self) -> None:
-        """Let the modules compute what the kernels did: without what is inactive."""
-        for layer in self._layers:
-            if (masked := MaskedLayer.of(layer)) is not None:
-                masked.remask()
 
     def _bound(self) -> Binding | None:
         """Where the tensors lie now; None if the kernels cannot read one."""
@@ -228,6 +234,11 @@ class KeptInference:
 
     def __reduce__(self) -> Any:
         return KeptInference, ()
+
+    @property
+    def found(self) -> bool:
+        """Whether there was one at the last call, with its tensors on the CPU."""
+        return self._inference is not None and self._inference.on_cpu
 
     def get(self, find: Callable[[], tuple[Paths, list[nn.Module]]]) -> Inference | None:
         """The inference; None where the modules must be called one by one.

@@ -16,6 +16,7 @@ from torch import nn
 
 from sb3_sparse.engine.chains import watched
 from sb3_sparse.engine.inference import MOST_INPUTS, Inference, KeptInference
+from sb3_sparse.engine.masked import MaskedLayer
 from sb3_sparse.engine.paths import Paths
 from sb3_sparse.policies.modes import Modes
 from sb3_sparse.policies.storage import KNOWN
@@ -67,6 +68,7 @@ class Acts(SwitchesModes, BasePolicy):
         """As in SB3."""
         actions = self._predicted(observation, deterministic)
         if actions is None:
+            self._enforce()
             return super().predict(observation, state, episode_start, deterministic)
         return actions, state
 
@@ -82,10 +84,11 @@ class Acts(SwitchesModes, BasePolicy):
         alone = observation.shape == shape
         if not alone and observation.shape[1:] != shape:
             return None
-        self._prepare_to_act()
+        obs = th.from_numpy(np.array(observation).reshape((-1, *shape)))
+        if not self._prepare_to_act(len(obs)):
+            obs = obs.to(self.device)
         with th.no_grad():
-            obs = np.array(observation).reshape((-1, *shape))
-            acted = self._predict(th.as_tensor(obs, device=self.device), deterministic)
+            acted = self._predict(obs, deterministic)
         actions: Actions = acted.cpu().numpy().reshape((-1, *acts))
         if isinstance(self.action_space, spaces.Box):
             if self.squash_output:
@@ -94,8 +97,17 @@ class Acts(SwitchesModes, BasePolicy):
                 actions = np.clip(actions, self.action_space.low, self.action_space.high)
         return actions.squeeze(axis=0) if alone else actions
 
-    def _prepare_to_act(self) -> None:
-        """Be in evaluation mode, with inactive weights at 0 where modules will read them."""
+    def _enforce(self) -> None:
+        """Set inactive weights to 0."""
+        raise NotImplementedError
+
+    def _prepare_to_act(self, count: int) -> bool:
+        """Be in evaluation mode; whether the kernels will act.
+
+        If not, inactive weights are set to 0, since modules will read them.
+
+        :param count: number of observations
+        """
         raise NotImplementedError
 
 
@@ -119,8 +131,17 @@ class Shortcut:
         """What computes the networks at once; None where modules must be called one by one."""
         return self._kept.get(lambda: self._find(root))
 
+    @property
+    def found(self) -> bool:
+        """Whether the kernels knew all modules the last time, and on the CPU."""
+        return self._kept.found
+
     def _find(self, root: nn.Module) -> tuple[Paths, list[nn.Module]]:
         kind: Any = type(root)
+        # Whoever counted on the kernels goes by the modules if they know them no more.
+        for module in root.modules():
+            if (layer := MaskedLayer.of(module)) is not None:
+                layer.remask()
         if "extract_features" in vars(root) or not _untouched(kind, ("extract_features",)):
             return [], [root]
         paths = [[root.get_submodule(name) for name in path] for path in self._paths]

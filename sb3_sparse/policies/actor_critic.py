@@ -52,9 +52,9 @@ class SparseActorCriticPolicy(SparsePolicyMixin, ActorCriticPolicy):
         if self.share_features_extractor:
             self._shortcuts["both"] = Shortcut((ACTOR, CRITIC))
 
-    def _acts_alone(self) -> bool:
+    def _by_kernels(self) -> bool:
         shortcut = self._shortcuts.get("actor")
-        return shortcut is not None and shortcut.inference(self) is not None
+        return shortcut is not None and shortcut.found
 
     def _results(self, networks: str, obs: Any, extractor: Any) -> list[th.Tensor] | None:
         shortcut = self._shortcuts.get(networks)

@@ -84,8 +84,8 @@ class SparseQRDQNPolicy(SparsePolicyMixin, QRDQNPolicy):
         kwargs = self._update_features_extractor(self.net_args, features_extractor=None)
         return SparseQuantileNetwork(**kwargs).to(self.device)
 
-    def _acts_alone(self) -> bool:
-        return self.quantile_net.acts_alone()
+    def _by_kernels(self) -> bool:
+        return self.quantile_net.by_kernels
 
     def _quicken(self) -> None:
         self.quantile_net.quicken()

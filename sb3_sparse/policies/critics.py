@@ -69,8 +69,8 @@ class SparseCriticsMixin(SparsePolicyMixin):
         kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
         return self.critic_class(**kwargs).to(self.device)
 
-    def _acts_alone(self) -> bool:
-        return self._acting().acts_alone()
+    def _by_kernels(self) -> bool:
+        return self._acting().by_kernels
 
     def _quicken(self) -> None:
         self._acting().quicken()

@@ -43,8 +43,8 @@ class SparseDQNPolicy(SparsePolicyMixin, DQNPolicy):
         kwargs = self._update_features_extractor(self.net_args, features_extractor=None)
         return SparseQNetwork(**kwargs).to(self.device)
 
-    def _acts_alone(self) -> bool:
-        return self.q_net.acts_alone()
+    def _by_kernels(self) -> bool:
+        return self.q_net.by_kernels
 
     def _quicken(self) -> None:
         self.q_net.quicken()

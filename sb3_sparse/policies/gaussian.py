@@ -76,7 +76,7 @@ class QuickSquashedGaussian(SquashedDiagGaussianDistribution):
         if not deterministic:
             noise = th.randn(gaussian.shape, dtype=gaussian.dtype, device=gaussian.device)
             gaussian = mean_actions + log_std.exp() * noise
-        if gaussian.isnan().any():  # SB3 says what is wrong
+        if math.isnan(gaussian.sum().item()):  # SB3 says what is wrong
             return super().actions_from_params(mean_actions, log_std, deterministic)
         self._remember(mean_actions, log_std)
         self.gaussian_actions = gaussian

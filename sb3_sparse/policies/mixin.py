@@ -14,6 +14,7 @@ from stable_baselines3.common.type_aliases import Schedule
 
 from sb3_sparse.engine.auto import AutoCompute
 from sb3_sparse.engine.controller import Controller
+from sb3_sparse.engine.inference import MOST_INPUTS
 from sb3_sparse.engine.linear import check_conversion
 from sb3_sparse.engine.optimizers import check_weight_decay, prefer_fused
 from sb3_sparse.engine.places import check_places
@@ -192,14 +193,19 @@ class SparsePolicyMixin(Acts):
         else:
             self.sparse.enforce()  # before anybody acts with what others have written
 
-    def _prepare_to_act(self) -> None:
+    def _enforce(self) -> None:
+        self.sparse.enforce()
+
+    def _prepare_to_act(self, count: int) -> bool:
         if not self._switch(False):
             check_places(self, self.sparse.layers)
-        if not self._acts_alone():
-            self.sparse.enforce()
+        if self._by_kernels() and count <= MOST_INPUTS:
+            return True
+        self._enforce()
+        return False
 
-    def _acts_alone(self) -> bool:
-        """Whether the kernels act, which see masks, and no module reads a weight."""
+    def _by_kernels(self) -> bool:
+        """Whether the kernels acted the last time."""
         raise NotImplementedError
 
     def parameters_to_vector(self) -> np.ndarray[Any, Any]:

@@ -12,6 +12,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
 from sb3_sparse.engine.foreign import Guard
+from sb3_sparse.engine.inference import MOST_INPUTS
 from sb3_sparse.engine.masked import MaskedLayer
 from sb3_sparse.engine.plain import make_plain
 from sb3_sparse.policies.acting import Acts, Shortcut, SwitchesModes
@@ -76,9 +77,10 @@ class ActingPart(SparsePart, Acts):
         """Act by the kernels from now on, where they know how."""
         self._shortcut = Shortcut(self.paths)
 
-    def acts_alone(self) -> bool:
-        """Whether the kernels act, which see masks, and no module reads a weight."""
-        return self._shortcut is not None and self._shortcut.inference(self) is not None
+    @property
+    def by_kernels(self) -> bool:
+        """Whether the kernels acted the last time."""
+        return self._shortcut is not None and self._shortcut.found
 
     def results(self, obs: Any) -> list[th.Tensor] | None:
         """What each of :attr:`paths` gives; None where modules must be called one by one."""
@@ -86,19 +88,17 @@ class ActingPart(SparsePart, Acts):
             return None
         return self._shortcut.results(self, obs, self.features_extractor)
 
-    def predict(self, *args: Any, **kwargs: Any) -> Any:
-        """As in SB3, with inactive weights at 0 whoever wrote them."""
-        if not self.acts_alone():
-            self._remask()
-        return super().predict(*args, **kwargs)
+    def _prepare_to_act(self, count: int) -> bool:
+        self.set_training_mode(False)
+        if self.by_kernels and count <= MOST_INPUTS:
+            return True
+        self._enforce()
+        return False
 
-    def _remask(self) -> None:
+    def _enforce(self) -> None:
         for module in self.modules():
             if (layer := MaskedLayer.of(module)) is not None:
                 layer.remask()
-
-    def _prepare_to_act(self) -> None:
-        self.set_training_mode(False)
 
 
 def without_graphs(root: nn.Module) -> dict[int, Any]:

@@ -240,8 +240,9 @@ def test_a_forward_that_was_patched_is_called():
         assert th.equal(model.policy.predict_values(obs), before)
 
 
-def test_inactive_weights_do_not_act_whoever_wrote_them(model):
-    obs = observations(model, 2)
+@pytest.mark.parametrize("count", [2, 20])
+def test_inactive_weights_do_not_act_whoever_wrote_them(model, count):
+    obs = observations(model, count)
     expected, _ = model.predict(obs, deterministic=True)
     for layer in model.policy.sparse.layers:
         if not layer.compact:
