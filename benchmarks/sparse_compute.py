@@ -37,6 +37,7 @@ from sb3_sparse.engine.chains import Chain
 from sb3_sparse.engine.linear import CompactLinear
 from sb3_sparse.engine.native.library import in_use, instruction_sets, use
 from sb3_sparse.engine.products import TILE, tiles_of
+from sb3_sparse.engine.sequential import chain_up
 from sb3_sparse.engine.structure import Structure
 from sb3_sparse.sparsity.widths import equivalent_widths
 
@@ -75,7 +76,7 @@ def layer_steps(width: int, batch: int, sparsity: float) -> dict[str, Callable[[
     x = th.randn(batch, width, requires_grad=True)
     grad = th.randn(batch, width)
     layer = CompactLinear.convert(twin, Structure(flat, (width, width)), is_target=False)
-    chain = Chain([layer], [True])
+    chain = Chain([layer], [th.nn.ReLU()])
     tiles = th.randn(tiles_of(batch), width, TILE, requires_grad=True)
     tiles_grad = th.randn(tiles_of(batch), width, TILE)
     csr = th.zeros(width * width)
@@ -121,20 +122,19 @@ def time_single(widths: list[int], sparsities: list[float], rounds: int) -> Iter
         x = th.randn(1, 17)
         for sparsity in sparsities:
             random = np.random.default_rng(0)
-            layers = []
-            for module in dense[::2]:
+            sparse = copy.deepcopy(dense)
+            for module in sparse[::2]:
                 flat = np.flatnonzero(random.random(module.weight.numel()) >= sparsity)
-                twin = copy.deepcopy(module)
                 shape = tuple(module.weight.shape)
-                layers.append(CompactLinear.convert(twin, Structure(flat, shape), is_target=False))
-            chain = Chain(layers, [True, True, False])
+                CompactLinear.convert(module, Structure(flat, shape), is_target=False)
+            chain_up(sparse)
 
             @th.no_grad()
             def by(network: Callable[[th.Tensor], th.Tensor], x=x) -> None:
                 for _ in range(200):
                     network(x)
 
-            steps = {"dense": partial(by, dense), "non-zeros": partial(by, chain)}
+            steps = {"dense": partial(by, dense), "non-zeros": partial(by, sparse)}
             times = interleaved(steps, rounds)
             yield from rows_of("one", f"17-{width}-{width}-6", 1, sparsity, times, 200)
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from weakref import ref
 
 import torch as th
+from torch import nn
 
 from sb3_sparse.engine.products import Pass, Products
 from sb3_sparse.errors import UnsupportedError
@@ -18,15 +19,17 @@ PLAIN = (th.Tensor, th.nn.Parameter)
 
 
 class Chain:
-    """Compact layers that follow each other, each perhaps with a ReLU.
+    """Compact layers that follow each other, each perhaps with an activation.
 
     :param layers: the layers
-    :param relus: whether a ReLU follows, for each
+    :param activations: what follows each: None, or a module that tells its slope by its result
     """
 
-    def __init__(self, layers: Sequence[CompactLinear], relus: Sequence[bool]) -> None:
+    def __init__(
+        self, layers: Sequence[CompactLinear], activations: Sequence[nn.Module | None]
+    ) -> None:
         self.layers = list(layers)
-        self.relus = list(relus)
+        self.activations = list(activations)
         self.columns = self.layers[0].in_features
         self.rows = self.layers[-1].out_features
         # A graph must not hold the layers: Python's garbage collector does not see through it, and
@@ -62,7 +65,7 @@ class Chain:
             structure, values = layer.live()
             structures.append(structure)
             parameters += [values, layer.bias]
-        how = Pass(self.relus, structures, self._references, batch, tiled_in, tiled_out)
+        how = Pass(self.activations, structures, self._references, batch, tiled_in, tiled_out)
         if watched(x):
             return how.by_dense_weights(x, parameters)
         if th.is_grad_enabled() and (

@@ -9,7 +9,6 @@ written it.
 from __future__ import annotations
 
 import ctypes
-import struct
 from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
@@ -17,11 +16,12 @@ import torch as th
 from torch import nn
 from torch.nn.modules.module import _has_any_global_hook
 
+from sb3_sparse.engine.activations import ACTIVATIONS, number_of
 from sb3_sparse.engine.chains import watched
 from sb3_sparse.engine.linear import CompactLinear
 from sb3_sparse.engine.masked import FLOAT_MASK_KEY, MaskedLayer
-from sb3_sparse.engine.native.library import library, why_missing
-from sb3_sparse.engine.paths import ACTIVATIONS, Paths, modules_of, parts_of
+from sb3_sparse.engine.native.library import bits_of, library, why_missing
+from sb3_sparse.engine.paths import Paths, modules_of, parts_of
 from sb3_sparse.engine.structure import Structure
 from sb3_sparse.engine.watch import Watch
 
@@ -199,27 +199,19 @@ class Inference:
                 start, column = layer.structure.addresses[:2]
             elif (mask := layer._buffers.get(FLOAT_MASK_KEY)) is not None:
                 mask_place = mask.data_ptr()
-            kind, a, b = (0, 0.0, 0.0)
-            if activation is not None:
-                kind, a, b = ACTIVATIONS[type(activation)](activation)
+            kind, a, b = number_of(activation)
             out = -1
             if number in self._ends:
                 out = self._places[self._ends.index(number)]
             bias = 0 if layer.bias is None else layer.bias.data_ptr()
             fields += (layer.out_features, layer.in_features, start, column)
-            fields += (layer.weight.data_ptr(), mask_place, bias, kind, _bits(a), _bits(b))
+            fields += (layer.weight.data_ptr(), mask_place, bias, kind, bits_of(a), bits_of(b))
             fields += (source, out)
         return (ctypes.c_int64 * len(fields))(*fields)
 
 
 def _readable(tensor: th.Tensor) -> bool:
     return tensor.dtype == th.float32 and tensor.is_cpu and tensor.is_contiguous()
-
-
-def _bits(number: float) -> int:
-    """A double as the integer of the same bits."""
-    found: int = struct.unpack("q", struct.pack("d", number))[0]
-    return found
 
 
 class KeptInference:

@@ -86,7 +86,7 @@ class CompactLinear(nn.Linear):
 
     def forward(self, input: th.Tensor) -> th.Tensor:
         """As of ``nn.Linear``."""
-        return Chain([self], [False])(input)
+        return Chain([self], [None])(input)
 
     def _apply(self, fn: Any, recurse: bool = True) -> Any:
         check_conversion(fn)

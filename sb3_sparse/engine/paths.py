@@ -2,35 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+from collections.abc import Iterable, Sequence
 
 from torch import nn
 
+from sb3_sparse.engine.activations import ACTIVATIONS
 from sb3_sparse.engine.linear import CompactLinear
 
-Activation = Callable[[Any], tuple[int, float, float]]
 Paths = Sequence[Sequence[nn.Module]]
 """Modules of each network in the order of computation."""
 OWN = ("torch.nn.", "sb3_sparse.engine.")
 """Where a ``Sequential`` that calls its parts in turn is defined; one of the user's may do more."""
-ACTIVATIONS: dict[type[nn.Module], Activation] = {
-    nn.ReLU: lambda _: (1, 0.0, 0.0),
-    nn.Tanh: lambda _: (2, 0.0, 0.0),
-    nn.Sigmoid: lambda _: (3, 0.0, 0.0),
-    nn.ELU: lambda m: (4, m.alpha, 0.0),
-    nn.CELU: lambda m: (5, m.alpha, 0.0),
-    nn.SELU: lambda _: (6, 0.0, 0.0),
-    nn.GELU: lambda m: (7 if m.approximate == "none" else 8, 0.0, 0.0),
-    nn.SiLU: lambda _: (9, 0.0, 0.0),
-    nn.Mish: lambda _: (10, 0.0, 0.0),
-    nn.Softplus: lambda m: (11, m.beta, m.threshold),
-    nn.LeakyReLU: lambda m: (12, m.negative_slope, 0.0),
-    nn.ReLU6: lambda _: (13, 0.0, 6.0),
-    nn.Hardtanh: lambda m: (13, m.min_val, m.max_val),
-    nn.Hardswish: lambda _: (14, 0.0, 0.0),
-}
-"""Number and parameters of an activation in ``kernels.h``."""
 
 
 def parts_of(path: Iterable[nn.Module]) -> list[tuple[nn.Linear, nn.Module | None]] | None:

@@ -12,15 +12,17 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import torch as th
+from torch import nn
 from torch.nn import functional
 
-from sb3_sparse.engine.native.library import BatchArgument, library
+from sb3_sparse.engine.activations import number_of
+from sb3_sparse.engine.native.library import BatchArgument, bits_of, library
 from sb3_sparse.engine.structure import Structure
 from sb3_sparse.errors import UnsupportedError
 
 TILE = 64
-FIELDS = 14
-VALUE_GRAD, BIAS_GRAD, OUTPUT_GRAD = 11, 12, 13
+FIELDS = 16
+VALUE_GRAD, BIAS_GRAD, OUTPUT_GRAD = 13, 14, 15
 """Places of a layer's fields in ``layer_t`` of ``kernels.h`` that only the way back fills."""
 
 
@@ -44,7 +46,7 @@ def tiles_of(batch: int) -> int:
 class Pass(NamedTuple):
     """One way forth, and perhaps back, of a batch through a chain."""
 
-    relus: list[bool]
+    activations: list[nn.Module | None]
     structures: list[Structure]
     layers: list[Any]
     batch: int
@@ -71,9 +73,12 @@ class Pass(NamedTuple):
                         f"contiguous float32 on the CPU, got {parameter.dtype} on "
                         f"{parameter.device} with strides {parameter.stride()}"
                     )
+            kind, a, b = number_of(self.activations[i])
             arguments += (
                 *structure.shape,
-                self.relus[i],
+                kind,
+                bits_of(a),
+                bits_of(b),
                 *structure.addresses,
                 values.data_ptr(),
                 0 if bias is None else bias.data_ptr(),
@@ -140,8 +145,8 @@ class Pass(NamedTuple):
                 values = values.data
             weight = values.new_zeros(rows * columns).index_put((flat,), values)
             x = functional.linear(x, weight.view(rows, columns), parameters[2 * i + 1])
-            if self.relus[i]:
-                x = functional.relu(x)
+            if (activation := self.activations[i]) is not None:
+                x = activation(x)
         if self.tiled_out:
             x = functional.pad(x, (0, 0, 0, tiles_of(self.batch) * TILE - self.batch))
             x = x.view(-1, TILE, self.rows).transpose(1, 2)
@@ -163,9 +168,9 @@ class Products(th.autograd.Function):
     def forward(ctx: Any, how: Pass, x: th.Tensor, *parameters: Any) -> th.Tensor:
         y, work, arguments = how.forward(x, parameters)
         ctx.how, ctx.arguments = how, arguments
-        # A tiled result is looked at on the way back where a ReLU made it. Where none did, an
-        # activation that works in place may change it.
-        kept = y if how.tiled_out and how.relus[-1] else None
+        # A tiled result is looked at on the way back where an activation made it. Where none did,
+        # one that works in place may change it.
+        kept = y if how.tiled_out and how.activations[-1] is not None else None
         ctx.save_for_backward(x, work, kept, *parameters)
         return y
 

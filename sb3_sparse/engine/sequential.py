@@ -9,10 +9,10 @@ import torch as th
 from torch import nn
 from torch.nn.modules.module import _has_any_global_hook
 
+from sb3_sparse.engine.activations import ACTIVATIONS, tells_its_slope
 from sb3_sparse.engine.chains import Chain, watched
 from sb3_sparse.engine.inference import KeptInference
 from sb3_sparse.engine.linear import CompactLinear
-from sb3_sparse.engine.paths import ACTIVATIONS
 
 ELEMENTWISE = (*ACTIVATIONS, nn.Identity)
 """Activations that may work on tiles as they are."""
@@ -68,11 +68,11 @@ def _steps(modules: Sequence[Any]) -> list[tuple[Any, bool, bool]]:
         last = groups[-1] if groups else None
         if isinstance(module, CompactLinear):
             if isinstance(last, list):
-                last.append((module, False))
+                last.append((module, None))
             else:
-                groups.append([(module, False)])
-        elif type(module) is nn.ReLU and isinstance(last, list) and not last[-1][1]:
-            last[-1] = (last[-1][0], True)
+                groups.append([(module, None)])
+        elif isinstance(last, list) and last[-1][1] is None and tells_its_slope(module):
+            last[-1] = (last[-1][0], module)
         else:
             groups.append(module)
     found: list[tuple[Any, bool, bool]] = []
@@ -82,10 +82,10 @@ def _steps(modules: Sequence[Any]) -> list[tuple[Any, bool, bool]]:
             tiled = tiled and type(group) in ELEMENTWISE
             found.append((group, False, False))
             continue
-        after = next((g for g in groups[i + 1 :] if type(g) not in ELEMENTWISE), None)
-        chain = Chain([module for module, _ in group], [relu for _, relu in group])
-        found.append((chain, tiled, isinstance(after, list)))
-        tiled = isinstance(after, list)
+        behind = next((g for g in groups[i + 1 :] if type(g) not in ELEMENTWISE), None)
+        chain = Chain([module for module, _ in group], [after for _, after in group])
+        found.append((chain, tiled, isinstance(behind, list)))
+        tiled = isinstance(behind, list)
     return found
 
 

@@ -44,7 +44,8 @@ def one_pass(lib, random, widths: list[int], batch: int, tiled: bool, threads: i
         grads = buffer(nnz), None if bias is None else buffer(rows)
         output, left = buffer(tiles, rows, TILE), buffer(tiles, rows, TILE)
         kept += [arrays, values, bias, grads, output, left]
-        layers += [rows, columns, int(random.random() < 0.5), *map(address, arrays)]
+        activation = int(random.choice([0, 1, 2, 3, 4, 6, 12, 13]))
+        layers += [rows, columns, activation, 0, 0, *map(address, arrays)]
         layers += map(address, (values, bias, output, *grads, left))
     packed = (ctypes.c_int64 * len(layers))(*layers)
     into, out = widths[0], widths[-1]

@@ -21,6 +21,24 @@ from sb3_sparse.engine.structure import Structure
 from sb3_sparse.errors import ConfigError, UnsupportedError
 
 TOLERANCE = 1e-5
+ELEMENTWISE = [
+    nn.Identity,
+    nn.ReLU,
+    nn.Tanh,
+    nn.Sigmoid,
+    nn.ELU,
+    partial(nn.ELU, 0.3),
+    partial(nn.ELU, -0.5),
+    partial(nn.CELU, 1.4),
+    nn.SELU,
+    partial(nn.LeakyReLU, 0.2),
+    partial(nn.LeakyReLU, -0.2),
+    nn.ReLU6,
+    partial(nn.Hardtanh, -0.4, 0.6),
+    nn.SiLU,
+    nn.GELU,
+    nn.Softplus,
+]
 
 
 @pytest.fixture(params=library.instruction_sets())
@@ -123,7 +141,7 @@ KINDS = ["some", "full", "empty row", "full row", "empty"]
 @given(
     widths=st.lists(st.integers(1, 70), min_size=2, max_size=5),
     kinds=st.lists(st.sampled_from(KINDS), min_size=1, max_size=4),
-    activation=st.sampled_from([nn.ReLU, nn.Tanh, nn.Identity, nn.ELU]),
+    activation=st.sampled_from(ELEMENTWISE),
     batch=st.integers(1, 200),
     bias=st.booleans(),
     seed=st.integers(0, 2**20),
@@ -134,9 +152,10 @@ def test_results_and_gradients_are_those_of_dense_masked_layers(
     compare(*networks(widths, kinds, activation, bias, seed), batch, seed)
 
 
+@pytest.mark.parametrize("activation", [nn.ReLU, nn.Tanh])
 @pytest.mark.parametrize("batch", [1, 15, 16, 17, 48, 63, 64, 65, 128, 250])
-def test_every_instruction_set_handles_every_batch(instructions, batch):
-    compare(*networks([23, 70, 33, 1], ["some", "full row"], nn.ReLU, True, 3), batch)
+def test_every_instruction_set_handles_every_batch(instructions, batch, activation):
+    compare(*networks([23, 70, 33, 1], ["some", "full row"], activation, True, 3), batch)
 
 
 def test_results_do_not_depend_on_the_number_of_threads(threads):

@@ -13,12 +13,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import nn
 
+from sb3_sparse.engine.activations import ACTIVATIONS
 from sb3_sparse.engine.gaussian import gaussian
 from sb3_sparse.engine.inference import Inference, KeptInference
 from sb3_sparse.engine.linear import CompactLinear
 from sb3_sparse.engine.masked import MaskedLayer
 from sb3_sparse.engine.native import library
-from sb3_sparse.engine.paths import ACTIVATIONS
 from sb3_sparse.engine.structure import Structure
 
 ELEMENTWISE = [

@@ -1,100 +1,5 @@
 /* Networks that act: a few observations through all layers in one call, nothing kept. */
-#include "vectors.h"
-
-#include <math.h>
-
-typedef int32_t ivec __attribute__((vector_size(WIDTH * 4)));
-
-INLINE vec choose(ivec mask, vec yes, vec no) {
-    return (vec)((mask & (ivec)yes) | (~mask & (ivec)no));
-}
-/* A NaN stays one: no comparison holds for it. */
-INLINE vec at_least(vec x, float least) { return choose(x < least, least + (vec){0}, x); }
-INLINE vec at_most(vec x, float most) { return choose(x > most, most + (vec){0}, x); }
-
-/* e^x = scale * (1 + rest): x = n ln 2 + r with |r| <= ln 2 / 2, scale = 2^n, rest = e^r - 1 by its
-   Taylor series. */
-INLINE vec rest_of_exp(vec x, vec *scale) {
-    const float to_integer = 12582912; /* 1.5 * 2^23: what is added to it is rounded */
-    x = at_most(at_least(x, -87), 88);
-    vec n = x * 1.44269504f + to_integer;
-    *scale = (vec)((ivec)n << 23); /* the low bits of its pattern are n */
-    *scale = (vec)((ivec)*scale + (127 << 23));
-    n -= to_integer;
-    vec r = (x - n * 0.693145752f) - n * 1.42860677e-6f; /* ln 2 in two parts */
-    vec p = r * (1.f / 5040) + 1.f / 720;
-    p = p * r + 1.f / 120;
-    p = p * r + 1.f / 24;
-    p = p * r + 1.f / 6;
-    p = p * r + 0.5f;
-    return p * (r * r) + r;
-}
-
-INLINE vec exp_of(vec x) {
-    vec scale, rest = rest_of_exp(x, &scale);
-    return scale * rest + scale;
-}
-
-/* e^x - 1, accurate near 0 too. */
-INLINE vec expm1_of(vec x) {
-    vec scale, rest = rest_of_exp(x, &scale);
-    return scale * rest + (scale - 1);
-}
-
-INLINE vec tanh_of(vec x) {
-    vec t = expm1_of(2 * at_most(at_least(x, -10), 10));
-    return t / (t + 2);
-}
-
-INLINE vec one_by_one(vec x, float (*function)(float, float, float), float a, float b) {
-    for (int i = 0; i < WIDTH; i++) x[i] = function(x[i], a, b);
-    return x;
-}
-static float gelu(float x, float a, float b) {
-    (void)a, (void)b;
-    return 0.5f * x * (1 + erff(x * 0.707106781f));
-}
-static float softplus(float x, float beta, float threshold) {
-    return x * beta > threshold ? x : log1pf(expf(x * beta)) / beta;
-}
-
-INLINE vec activated(int64_t kind, vec x, float a, float b) {
-    switch (kind) {
-    case RELU: return positive(x);
-    case TANH: return tanh_of(x);
-    case SIGMOID: return 1 / (1 + exp_of(-x));
-    case ELU: return choose(x < 0, a * expm1_of(x), x);
-    case CELU: return choose(x < 0, a * expm1_of(x / a), x);
-    case SELU: return 1.05070099f * choose(x < 0, 1.67326324f * expm1_of(x), x);
-    case GELU: return one_by_one(x, gelu, a, b);
-    case GELU_TANH: return 0.5f * x * (1 + tanh_of(0.797884561f * (x + 0.044715f * x * x * x)));
-    case SILU: return x / (1 + exp_of(-x));
-    case MISH: {
-        vec e = exp_of(at_most(x, 20)); /* tanh(ln(1 + e)) = ((1 + e)^2 - 1) / ((1 + e)^2 + 1) */
-        vec t = e * (e + 2);
-        return x * (t / (t + 2));
-    }
-    case SOFTPLUS: return one_by_one(x, softplus, a, b);
-    case LEAKY_RELU: return choose(x < 0, a * x, x);
-    case HARDTANH: return at_most(at_least(x, a), b);
-    case HARDSWISH: return x * at_most(at_least(x + 3, 0), 6) / 6;
-    default: return x;
-    }
-}
-
-static void activate(const step_t *step, float *y, int64_t count) {
-#define CASE(kind)                                                                   \
-    case kind:                                                                       \
-        for (int64_t i = 0; i < count; i += WIDTH)                                   \
-            STORE(y + i, activated(kind, LOAD(y + i), (float)step->a, (float)step->b)); \
-        break;
-    switch (step->activation) {
-        CASE(RELU) CASE(TANH) CASE(SIGMOID) CASE(ELU) CASE(CELU) CASE(SELU) CASE(GELU)
-        CASE(GELU_TANH) CASE(SILU) CASE(MISH) CASE(SOFTPLUS) CASE(LEAKY_RELU) CASE(HARDTANH)
-        CASE(HARDSWISH)
-    }
-#undef CASE
-}
+#include "activations.h"
 
 /* The first `left` of WIDTH elements, the rest 0. */
 INLINE vec first(const float *from, int64_t left) {
@@ -236,7 +141,7 @@ int NAMED(act, SUFFIX)(const step_t *steps, int64_t count, int64_t batch, const 
             one(step, from, place[s]);
         else
             several(step, batch, from, place[s]);
-        activate(step, place[s], step->rows * lanes);
+        activate(step->activation, (float)step->a, (float)step->b, place[s], step->rows * lanes);
         if (step->out < 0) continue;
         float *to = y + step->out * batch;
         if (batch == 1)

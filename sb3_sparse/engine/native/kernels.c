@@ -1,4 +1,4 @@
-#include "vectors.h"
+#include "activations.h"
 
 #include <stdlib.h>
 
@@ -90,6 +90,20 @@ static int64_t vectors_of(const batch_t *batch, int64_t tile) {
     return (entries_of(batch, tile) + WIDTH - 1) / WIDTH;
 }
 
+/* The functions behind ReLU on a tile; ReLU itself is a part of the products. */
+static void activate_tile(const layer_t *layer, int64_t vectors, float *y) {
+    int64_t whole = vectors * WIDTH == TILE, rows = whole ? 1 : layer->rows;
+    int64_t count = whole ? layer->rows * TILE : vectors * WIDTH;
+    for (int64_t r = 0; r < rows; r++)
+        activate(layer->activation, (float)layer->a, (float)layer->b, y + r * TILE, count);
+}
+static void slope_tile(const layer_t *layer, int64_t vectors, const float *y, float *g) {
+    int64_t whole = vectors * WIDTH == TILE, rows = whole ? 1 : layer->rows;
+    int64_t count = whole ? layer->rows * TILE : vectors * WIDTH;
+    for (int64_t r = 0; r < rows; r++)
+        slope(layer->activation, (float)layer->a, (float)layer->b, y + r * TILE, g + r * TILE, count);
+}
+
 static void forward_share(share_t *share) {
     const batch_t *batch = share->batch;
     const layer_t *layers = share->layers, *last = layers + batch->layers - 1;
@@ -101,7 +115,8 @@ static void forward_share(share_t *share) {
         for (const layer_t *layer = layers; layer <= last; layer++) {
             float *y = layer->output + t * layer->rows * TILE;
             gather(vectors, layer->rows, layer->row_start, layer->column, layer->value,
-                   layer->bias, 0, (int)layer->relu, x, y);
+                   layer->bias, 0, layer->activation == RELU, x, y);
+            if (layer->activation > RELU) activate_tile(layer, vectors, y);
             x = y;
         }
         if (batch->rows_out)
@@ -115,18 +130,15 @@ static void backward_share(share_t *share) {
     int64_t first = share->first, last = share->last;
     const float *g = share->scratch[0];
     int64_t size = top->rows * TILE;
-    if (!batch->rows_grad && !top->relu) g = batch->tiles_grad + first * size;
+    if (!batch->rows_grad && !top->activation) g = batch->tiles_grad + first * size;
     for (int64_t t = first; t < last && g == share->scratch[0]; t++) {
         float *to = share->scratch[0] + (t - first) * size;
-        const float *from = to, *y = top->output + t * size;
         if (batch->rows_grad)
             to_tile(batch->rows_grad + t * TILE * top->rows, entries_of(batch, t), top->rows, TILE,
                     to);
         else
-            from = batch->tiles_grad + t * size;
-        for (int64_t r = 0; r < size && top->relu; r += TILE)
-            for (int64_t b = r; b < r + vectors_of(batch, t) * WIDTH; b += WIDTH)
-                STORE(to + b, where_positive(LOAD(from + b), LOAD(y + b)));
+            memcpy(to, batch->tiles_grad + t * size, (size_t)size * sizeof *to);
+        if (top->activation) slope_tile(top, vectors_of(batch, t), top->output + t * size, to);
     }
     for (int64_t l = batch->layers - 1; l >= 0; l--) {
         const layer_t *layer = layers + l;
@@ -146,10 +158,14 @@ static void backward_share(share_t *share) {
         if (l == 0 && !batch->rows_input_grad && !batch->tiles_input_grad) return;
         float *next = g == share->scratch[0] ? share->scratch[1] : share->scratch[0];
         if (l == 0 && batch->tiles_input_grad) next = batch->tiles_input_grad + first * into;
-        for (int64_t t = first; t < last; t++)
+        int64_t before = l ? layers[l - 1].activation : IDENTITY;
+        for (int64_t t = first; t < last; t++) {
+            float *to = next + (t - first) * into;
             gather(vectors_of(batch, t), layer->columns, layer->column_start, layer->row,
-                   share->values[l], 0, l && layers[l - 1].relu ? x + t * into : 0, 0,
-                   g + (t - first) * out, next + (t - first) * into);
+                   share->values[l], 0, before == RELU ? x + t * into : 0, 0,
+                   g + (t - first) * out, to);
+            if (before > RELU) slope_tile(layer - 1, vectors_of(batch, t), x + t * into, to);
+        }
         g = next;
     }
     for (int64_t t = first; t < last && batch->rows_input_grad; t++)

@@ -16,11 +16,12 @@
 #define TILE 64
 #define LANES 16 /* of a small batch, which has tiles of its own */
 
-/* One layer, y = relu(W x + b). All fields are 8 bytes wide; Python fills them in this order. */
+/* One layer, y = f(W x + b). All fields are 8 bytes wide; Python fills them in this order. */
 typedef struct {
     int64_t rows;                /* outputs */
     int64_t columns;             /* inputs */
-    int64_t relu;                /* whether a ReLU follows */
+    int64_t activation;          /* what follows: one whose slope its result tells */
+    double a, b;                 /* its parameters */
     const int32_t *row_start;    /* [rows + 1]: where each row's connections begin */
     const int32_t *column;       /* [nnz] */
     const int32_t *column_start; /* [columns + 1]: the same by columns */

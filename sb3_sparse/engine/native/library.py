@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import struct
 from functools import cache
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import torch as th
 from sb3_sparse.errors import ConfigError, MissingKernels
 
 PATH = Path(__file__).with_name("kernels.so")
-VERSION = 2
+VERSION = 3
 """Of what the two sides hand each other; ``dispatch.c`` has the same."""
 
 
@@ -33,6 +34,12 @@ class BatchArgument(ctypes.Structure):
             "tiles_input_grad",
         )
     ]
+
+
+def bits_of(number: float) -> int:
+    """A double as the integer of the same bits, for structures of which Python fills integers."""
+    found: int = struct.unpack("q", struct.pack("d", number))[0]
+    return found
 
 
 @cache

@@ -1,0 +1,50 @@
+"""Activations that the kernels know."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from torch import nn
+
+Activation = Callable[[Any], tuple[int, float, float]]
+ACTIVATIONS: dict[type[nn.Module], Activation] = {
+    nn.ReLU: lambda _: (1, 0.0, 0.0),
+    nn.Tanh: lambda _: (2, 0.0, 0.0),
+    nn.Sigmoid: lambda _: (3, 0.0, 0.0),
+    nn.ELU: lambda m: (4, m.alpha, 0.0),
+    nn.CELU: lambda m: (5, m.alpha, 0.0),
+    nn.SELU: lambda _: (6, 0.0, 0.0),
+    nn.GELU: lambda m: (7 if m.approximate == "none" else 8, 0.0, 0.0),
+    nn.SiLU: lambda _: (9, 0.0, 0.0),
+    nn.Mish: lambda _: (10, 0.0, 0.0),
+    nn.Softplus: lambda m: (11, m.beta, m.threshold),
+    nn.LeakyReLU: lambda m: (12, m.negative_slope, 0.0),
+    nn.ReLU6: lambda _: (13, 0.0, 6.0),
+    nn.Hardtanh: lambda m: (13, m.min_val, m.max_val),
+    nn.Hardswish: lambda _: (14, 0.0, 0.0),
+}
+"""Number and parameters of an activation in ``kernels.h``."""
+
+_WITH_SLOPE: dict[type[nn.Module], Callable[[Any], bool]] = {
+    nn.ReLU: lambda _: True,
+    nn.Tanh: lambda _: True,
+    nn.Sigmoid: lambda _: True,
+    nn.ELU: lambda m: m.alpha >= 0,
+    nn.CELU: lambda m: m.alpha > 0,
+    nn.SELU: lambda _: True,
+    nn.LeakyReLU: lambda m: m.negative_slope >= 0,
+    nn.ReLU6: lambda _: True,
+    nn.Hardtanh: lambda _: True,
+}
+
+
+def tells_its_slope(module: nn.Module) -> bool:
+    """Whether the slope follows from the result alone, as the kernels' way back needs it."""
+    tells = _WITH_SLOPE.get(type(module))
+    return tells is not None and tells(module)
+
+
+def number_of(module: nn.Module | None) -> tuple[int, float, float]:
+    """Number and parameters of an activation in ``kernels.h``; None: nothing follows."""
+    return (0, 0.0, 0.0) if module is None else ACTIVATIONS[type(module)](module)
