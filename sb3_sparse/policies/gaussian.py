@@ -15,6 +15,7 @@ from stable_baselines3.common.distributions import SquashedDiagGaussianDistribut
 from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN
 from torch.autograd.function import once_differentiable
 
+from sb3_sparse.engine.gaussian import squashed
 from sb3_sparse.policies.parts import ActingPart
 
 LOG_OF_ROOT_OF_TWO_PI = 0.5 * math.log(2.0 * math.pi)
@@ -68,19 +69,20 @@ class QuickSquashedGaussian(SquashedDiagGaussianDistribution):
         self._remember(mean_actions, log_std)
         return action, log_prob
 
-    def actions_from_params(
-        self, mean_actions: th.Tensor, log_std: th.Tensor, deterministic: bool = False
-    ) -> th.Tensor:
-        """As in SB3: actions of shape ``(n, dim)``."""
-        gaussian = mean_actions
-        if not deterministic:
-            noise = th.randn(gaussian.shape, dtype=gaussian.dtype, device=gaussian.device)
-            gaussian = mean_actions + log_std.exp() * noise
-        if math.isnan(gaussian.sum().item()):  # SB3 says what is wrong
-            return super().actions_from_params(mean_actions, log_std, deterministic)
-        self._remember(mean_actions, log_std)
-        self.gaussian_actions = gaussian
-        return gaussian.tanh()
+    def act(self, mean: th.Tensor, log_std: th.Tensor, deterministic: bool) -> th.Tensor | None:
+        """Actions, without a graph: those of SB3, of the same random numbers.
+
+        :param mean: shape ``(n, dim)``
+        :param log_std: the same shape; brought into SB3's bounds in place
+        :return: shape ``(n, dim)``; None if one is not finite
+        """
+        noise = None if deterministic else th.randn(mean.shape, dtype=th.float32)
+        made = th.empty((2, *mean.shape), dtype=th.float32)
+        if squashed(mean, log_std, (LOG_STD_MIN, LOG_STD_MAX), noise, made):
+            return None
+        self._remember(mean, log_std)
+        self.gaussian_actions, actions = made.unbind()
+        return actions
 
     def _remember(self, mean_actions: th.Tensor, log_std: th.Tensor) -> None:
         self._mean, self._log_std = mean_actions, log_std
@@ -110,12 +112,12 @@ class GaussianActor(ActingPart):
             quick = QuickSquashedGaussian(distribution.action_dim, distribution.epsilon)
             vars(self)["action_dist"] = quick
 
-    def get_action_dist_params(self, obs: Any) -> tuple[th.Tensor, th.Tensor, dict[str, th.Tensor]]:
-        """As in SB3: mean and log standard deviation, shape ``(n, dim)`` each."""
+    def forward(self, obs: Any, deterministic: bool = False) -> th.Tensor:
+        """As in SB3: actions of shape ``(n, dim)``."""
         results = self.results(obs)
-        if results is None:
-            found: tuple[th.Tensor, th.Tensor, dict[str, th.Tensor]]
-            found = super().get_action_dist_params(obs)  # type: ignore[misc]
-            return found
-        mean, log_std = results
-        return mean, log_std.clamp_(LOG_STD_MIN, LOG_STD_MAX), {}
+        if results is not None and isinstance(self.action_dist, QuickSquashedGaussian):
+            actions = self.action_dist.act(results[0], results[1], deterministic)
+            if actions is not None:
+                return actions
+        found: th.Tensor = super().forward(obs, deterministic)
+        return found

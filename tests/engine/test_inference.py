@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from torch import nn
 
 from sb3_sparse.engine.activations import ACTIVATIONS
-from sb3_sparse.engine.gaussian import gaussian
+from sb3_sparse.engine.gaussian import gaussian, squashed
 from sb3_sparse.engine.inference import Inference, KeptInference
 from sb3_sparse.engine.linear import CompactLinear
 from sb3_sparse.engine.masked import MaskedLayer
@@ -315,3 +315,23 @@ def test_a_gaussian_without_end_is_reported():
     assert gaussian(th.zeros(1, 1), th.tensor([-200.0]), None, made)
     assert gaussian(th.full((1, 1), th.nan), th.zeros(1), None, made)
     assert not gaussian(th.zeros(1, 1), th.zeros(1), None, made)
+
+
+@given(
+    mean=st.floats(-50, 50, width=32),
+    log_std=st.floats(-30, 10, width=32),
+    noise=st.floats(-4, 4, width=32),
+)
+def test_squashed_actions_are_those_of_the_formula(mean, log_std, noise):
+    means, noises = th.tensor([[mean, 0.5]]), th.tensor([[noise, -1.0]])
+    log_stds = th.tensor([[log_std, 0.1]])
+    bounded = log_stds.clamp(-20, 2)
+    made = th.empty(2, 1, 2)
+    assert not squashed(means, log_stds, (-20, 2), noises, made)
+    assert th.equal(log_stds, bounded)
+    before = means + bounded.exp() * noises
+    np.testing.assert_allclose(made[0], before, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(made[1], before.tanh(), rtol=1e-6, atol=1e-6)
+    assert not squashed(means, log_stds, (-20, 2), None, made)
+    np.testing.assert_allclose(made, th.stack([means, means.tanh()]), rtol=1e-6)
+    assert squashed(th.full((1, 2), th.nan), log_stds, (-20, 2), None, made)

@@ -52,7 +52,7 @@ static int runs_here(const kernels_t *kernels) {
 #define EXPORT __attribute__((visibility("default")))
 
 /* Changes with every change of what Python hands over. */
-EXPORT int sb3_sparse_version(void) { return 3; }
+EXPORT int sb3_sparse_version(void) { return 4; }
 
 openmp_t sb3_sparse_openmp;
 
@@ -133,6 +133,20 @@ EXPORT int sb3_sparse_gaussian(int64_t count, int64_t size, const float *mean, c
             log_prob[n] -= away * away / 2 + log_std[d] + 0.918938533f; /* ln sqrt(2 pi) */
         }
         wrong += log_prob[n] - log_prob[n];
+    }
+    return wrong != wrong;
+}
+
+/* Actions tanh(u) with u = mean + e^log_std * noise (without noise: the mean), element by element, and
+   u itself; log_std is brought into its bounds. 1 if one is not finite, else 0. */
+EXPORT int sb3_sparse_squashed(int64_t count, double least, double most, const float *mean,
+                               float *log_std, const float *noise, float *gaussian, float *action) {
+    float wrong = 0, low = (float)least, high = (float)most;
+    for (int64_t i = 0; i < count; i++) {
+        log_std[i] = log_std[i] < low ? low : log_std[i] > high ? high : log_std[i];
+        gaussian[i] = noise ? mean[i] + expf(log_std[i]) * noise[i] : mean[i];
+        action[i] = tanhf(gaussian[i]);
+        wrong += gaussian[i] - gaussian[i];
     }
     return wrong != wrong;
 }

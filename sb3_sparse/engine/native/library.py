@@ -12,7 +12,7 @@ import torch as th
 from sb3_sparse.errors import ConfigError, MissingKernels
 
 PATH = Path(__file__).with_name("kernels.so")
-VERSION = 3
+VERSION = 4
 """Of what the two sides hand each other; ``dispatch.c`` has the same."""
 
 
@@ -70,6 +70,11 @@ def library() -> ctypes.CDLL:
         ctypes.c_void_p,
     ]
     found.sb3_sparse_gaussian.argtypes = [*(ctypes.c_int64,) * 2, *(ctypes.c_void_p,) * 5]
+    found.sb3_sparse_squashed.argtypes = [
+        ctypes.c_int64,
+        *(ctypes.c_double,) * 2,
+        *(ctypes.c_void_p,) * 5,
+    ]
     _use(found, found.sb3_sparse_instructions(0).decode())
     _share_threads(found)
     return found
