@@ -1,9 +1,9 @@
 """Which linear layers store and compute their active connections only: ``compute="auto"``.
 
-The rule goes by shapes and counts alone, so equal seeds give equal runs. A run of layers with
-nothing but activations between them is one decision, since changing between rows and tiles costs
-most where it happens. It computes on non-zeros if one of its layers is large and sparse: from there
-on that was quicker on every processor measured (docs/compute.md).
+The rule goes by shapes, counts and the kernels' instruction set, so equal seeds give equal runs on
+a machine. A run of layers with nothing but activations between them is one decision, since changing
+between rows and tiles costs most where it happens. It computes on non-zeros if one of its layers is
+large and sparse enough (docs/compute.md has the measurements).
 """
 
 from __future__ import annotations
@@ -14,14 +14,16 @@ import torch as th
 from torch import nn
 
 from sb3_sparse.engine.layers import SparseLayer
-from sb3_sparse.engine.native.library import why_missing
+from sb3_sparse.engine.native.library import in_use, why_missing
 from sb3_sparse.engine.optimizers import acts_elementwise
 from sb3_sparse.engine.sequential import ELEMENTWISE
 
-LARGE = 2**15
+LARGE = 2**13
 """Connections of a dense layer below which overhead decides."""
-SPARSE = 0.25
-"""Density up to which a large layer pays for its run."""
+HUGE = 2**18
+"""Connections of a dense layer beyond which dense products are at their best."""
+WITH_VECTORS = ("avx512", "avx2")
+"""Instruction sets whose kernels keep up with dense products of some density."""
 
 
 class AutoCompute:
@@ -71,9 +73,22 @@ def choose(root: nn.Module, layers: Iterable[SparseLayer], allowed: Container[st
     return [
         layer.name
         for run in runs_of(root, (layer for layer in layers if layer.name in allowed))
-        if any(layer.size >= LARGE and layer.nnz <= SPARSE * layer.size for layer in run)
+        if any(pays(layer.size, layer.nnz) for layer in run)
         for layer in run
     ]
+
+
+def pays(size: int, nnz: int) -> bool:
+    """Whether a layer computes so much quicker on its non-zeros that its run should.
+
+    :param size: connections of the dense layer
+    :param nnz: active ones
+    """
+    if size < LARGE:
+        return False
+    if in_use() not in WITH_VECTORS:
+        return nnz <= size / 4
+    return nnz <= (size / 2 if size <= HUGE else size * 3 / 8)
 
 
 def runs_of(root: nn.Module, layers: Iterable[SparseLayer]) -> list[list[SparseLayer]]:

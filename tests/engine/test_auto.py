@@ -47,15 +47,34 @@ def test_runs_are_linear_layers_with_activations_between_them():
     assert names == [["2"], ["0.0", "0.2"], ["0.4"]]
 
 
-def test_a_run_computes_on_non_zeros_if_a_layer_in_it_is_large_and_sparse():
+@pytest.fixture
+def use():
+    before = library.in_use()
+    yield library.use
+    library.use(before)
+
+
+@pytest.mark.parametrize("instructions", library.instruction_sets())
+def test_a_run_computes_on_non_zeros_if_a_layer_in_it_is_large_and_sparse(use, instructions):
+    use(instructions)
+    most = 0.5 if instructions in ("avx512", "avx2") else 0.25
     root = nn.Sequential(
-        nn.Linear(8, 256), nn.Tanh(), nn.Linear(256, 128), nn.LayerNorm(128), nn.Linear(128, 3)
-    )  # 256 x 128 = 32,768 = 2**15
-    assert choose(root, layers_of(root, 0.25), All()) == ["0", "2"]
-    assert choose(root, layers_of(root, 0.26), All()) == []
-    assert choose(root, layers_of(root, 0.25), {"0", "4"}) == []
-    root[2] = nn.Linear(256, 127)
+        nn.Linear(8, 128), nn.Tanh(), nn.Linear(128, 64), nn.LayerNorm(64), nn.Linear(64, 3)
+    )  # 128 x 64 = 8,192 = 2**13
+    assert choose(root, layers_of(root, most), All()) == ["0", "2"]
+    assert choose(root, layers_of(root, most + 0.01), All()) == []
+    assert choose(root, layers_of(root, most), {"0", "4"}) == []
+    root[2] = nn.Linear(128, 63)
     assert choose(root, layers_of(root, 0.1), All()) == []
+
+
+@pytest.mark.parametrize("instructions", library.instruction_sets())
+def test_a_huge_layer_must_be_sparser(use, instructions):
+    use(instructions)
+    most = 0.375 if instructions in ("avx512", "avx2") else 0.25
+    root = nn.Sequential(nn.Linear(513, 512))
+    assert choose(root, layers_of(root, most), All()) == ["0"]
+    assert choose(root, layers_of(root, most + 0.01), All()) == []
 
 
 def test_missing_kernels_keep_masks(monkeypatch, tmp_path):
