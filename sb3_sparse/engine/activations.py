@@ -26,6 +26,8 @@ ACTIVATIONS: dict[type[nn.Module], Activation] = {
 }
 """Number and parameters of an activation in ``kernels.h``."""
 
+ADJUSTABLE = (nn.ELU, nn.CELU, nn.GELU, nn.Softplus, nn.LeakyReLU, nn.Hardtanh)
+"""Those with parameters, which may be set anew."""
 _WITH_SLOPE: dict[type[nn.Module], Callable[[Any], bool]] = {
     nn.ReLU: lambda _: True,
     nn.Tanh: lambda _: True,

@@ -16,7 +16,7 @@ import torch as th
 from torch import nn
 from torch.nn.modules.module import _has_any_global_hook
 
-from sb3_sparse.engine.activations import ACTIVATIONS, number_of
+from sb3_sparse.engine.activations import ADJUSTABLE, number_of
 from sb3_sparse.engine.chains import watched
 from sb3_sparse.engine.linear import CompactLinear
 from sb3_sparse.engine.masked import FLOAT_MASK_KEY, MaskedLayer
@@ -68,9 +68,7 @@ class Inference:
         self._layers = [step.layer for step in steps]
         self._compact = [layer for layer in self._layers if isinstance(layer, CompactLinear)]
         self._activations = [step.activation for step in steps if step.activation is not None]
-        self._adjustable = [
-            module for module in self._activations if any(ACTIVATIONS[type(module)](module)[1:])
-        ]
+        self._adjustable = [m for m in self._activations if isinstance(m, ADJUSTABLE)]
         self._hooks = [
             hooks
             for module in modules
@@ -171,7 +169,7 @@ class Inference:
         """Where the tensors lie now; None if the kernels cannot read one."""
         tensors = [tensor.data_ptr() for tensor in self._tensors]
         structures = [layer.structure for layer in self._compact]
-        activations = [ACTIVATIONS[type(module)](module) for module in self._adjustable]
+        activations = [number_of(module) for module in self._adjustable]
         binding = self._binding
         if (
             binding is not None
@@ -240,6 +238,7 @@ class KeptInference:
         """
         if self._watch is None or not self._watch.unchanged():
             paths, around = find()
-            self._watch = Watch([*around, *modules_of(paths)])
+            watch = Watch([*around, *modules_of(paths)])
             self._inference = Inference.of(paths, around[1:])
+            self._watch = watch  # last: another thread may be looking
         return self._inference

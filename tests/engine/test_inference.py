@@ -257,6 +257,15 @@ def test_it_follows_every_change(storage, change):
     close(now(), by_modules(net, x))
 
 
+def test_a_parameter_of_an_activation_that_was_zero_is_followed():
+    net = nn.Sequential(nn.Linear(3, 3), nn.LeakyReLU(0.0))
+    found = Inference.of([[net]])
+    x = th.randn(4, 3)
+    found(x)
+    net[1].negative_slope = 0.5
+    close(found(x)[0], by_modules(net, x))
+
+
 def test_a_square_weight_that_is_transposed_in_place_is_not_misread():
     layer = nn.Linear(4, 4)
     found = Inference.of([[layer]])
