@@ -11,8 +11,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import torch._dynamo  # noqa: F401 by the first optimizer that is made, in a second
-
 from sb3_sparse.errors import ConfigError, Diverged, RunBusy
 from sb3_sparse.experiments.cell import Cell
 from sb3_sparse.experiments.measures import FILES

@@ -39,6 +39,8 @@ def main() -> None:
     for module in plan.modules:
         with suppress(Exception):  # the job will fail by it, and say so
             import_module(module)
+    if "torch" in sys.modules:
+        import_module("torch._dynamo")  # as its first optimizer does, which takes a second
     gc.freeze()  # or each job's collections would copy all pages
     interrupt = signal.signal(signal.SIGINT, signal.SIG_IGN)  # of which jobs hear by themselves
     end = _end_of_input()
