@@ -88,7 +88,7 @@ def pays(size: int, nnz: int) -> bool:
         return False
     if in_use() not in WITH_VECTORS:
         return nnz <= size / 4
-    return nnz <= (size / 2 if size <= HUGE else size * 3 / 8)
+    return nnz <= (size / 2 if size <= HUGE else size * 2 / 5)
 
 
 def runs_of(root: nn.Module, layers: Iterable[SparseLayer]) -> list[list[SparseLayer]]:
