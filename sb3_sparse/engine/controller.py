@@ -117,10 +117,12 @@ class Controller:
                 optimizer.register_state_dict_pre_hook(self._settle_moments),
                 optimizer.register_state_dict_post_hook(self._saved_form),
             ]
+            after = self._trust
             if not acts_elementwise(optimizer):
                 owned = [n.layers for n in self.networks if n.optimizer is optimizer]
                 check_masked(optimizer, chain.from_iterable(owned))
-                handles.append(optimizer.register_step_post_hook(self._after_step))
+                after = self._after_step
+            handles.append(optimizer.register_step_post_hook(after))
         return handles
 
     def compact(self, root: nn.Module, names: Container[str] | None = None) -> None:
@@ -181,6 +183,11 @@ class Controller:
         for network in self.networks:
             network.remask()
 
+    def notice(self) -> None:
+        """The same, where torch has counted a write since."""
+        for network in self.networks:
+            network.notice()
+
     def start(self, plan: Plan, soft_targets: bool, in_force: Callable[[], bool]) -> None:
         """Let masks move from now on.
 
@@ -234,11 +241,18 @@ class Controller:
                 self._warned = True
                 warn_of_no_plan(self.sparsity)
             for layer in network.sparse_layers:
+                layer.notice()
                 layer.mask_gradient()  # others may have written it after our hooks
             if self.plan is not None:
                 self._update_if_due(network, self.plan)
             if self.weight_decay:
                 add_weight_decay(network.kernels, self.weight_decay)
+
+    def _trust(self, optimizer: th.optim.Optimizer, args: object, kwargs: object) -> None:
+        """Of optimizers that keep a weight at 0 whose gradient is 0."""
+        for network in self.networks:
+            if network.optimizer is optimizer:
+                network.trust()
 
     def _after_step(self, optimizer: th.optim.Optimizer, args: object, kwargs: object) -> None:
         """Of optimizers that write to what is inactive."""
@@ -272,28 +286,5 @@ class Controller:
         self, network: SparseNetwork, plan: Plan, gradients: dict[str, th.Tensor | None]
     ) -> None:
         moment = plan.moment(network.clock, self.progress, self.seed)
-        nnz = network.nnz
-        dropped = grown = 0
-        for layer in network.layers:
-            if layer.frozen:
-                continue
-            gradient = gradients.get(layer.name)
-            dense_grad = None
-            if plan.topology.needs_gradient:
-                if gradient is None:
-                    continue
-                dense_grad = gradient.detach().cpu().numpy().ravel()
-            exchange = plan.topology.exchange(layer, moment, dense_grad=dense_grad)
-            if not exchange:
-                continue
-            layer.move(
-                exchange,
-                self.optimizers,
-                soft_targets=self.soft_targets,
-                dense_grad=gradient if plan.update_on == "step" else None,
-            )
-            dropped += exchange.dropped.size
-            grown += exchange.grown.size
-        if dropped or grown:
-            network.mask_updates += 1
-            network.churn = dropped / nnz
+        at_once = plan.update_on == "step"
+        network.move(plan.topology, moment, gradients, self.optimizers, self.soft_targets, at_once)

@@ -87,6 +87,17 @@ class SparseLayer(ABC):
     def remask(self) -> None:
         """Set to 0 what the mask has inactive, after somebody wrote the weight."""
 
+    def notice(self) -> None:
+        """As :meth:`remask`, but only if torch has counted a write since; cheap where it has not.
+
+        A write through ``.data`` or NumPy is not counted.
+        """
+        self.remask()
+
+    def trust(self) -> None:
+        """What torch has counted just now kept to the mask, as an optimizer's step does."""
+        return None
+
     @abstractmethod
     def mask_gradient(self) -> None:
         """Set to 0 what the mask has inactive in a gradient that came while no hook was on it."""

@@ -45,6 +45,7 @@ class MaskedLayer(SparseLayer):
         super().__init__(name, module, tuple(module.weight.shape))
         self._targets: list[Kernel] = []
         self._connections = object()
+        self._seen: tuple[int, int] | None = None
         ones = th.ones_like(module.weight, requires_grad=False)
         module.register_buffer(MASK_KEY, ones.bool())
         module.register_buffer(FLOAT_MASK_KEY, ones, persistent=False)
@@ -141,6 +142,16 @@ class MaskedLayer(SparseLayer):
         # Through .data: a graph that is alive, perhaps in another thread, goes on to be valid.
         if not self.full:
             self.weight.data.mul_(self.float_mask)
+            self.trust()
+
+    def notice(self) -> None:
+        weight = self.weight
+        if (weight._version, weight.data_ptr()) != self._seen:
+            self.remask()
+
+    def trust(self) -> None:
+        weight = self.weight
+        self._seen = weight._version, weight.data_ptr()
 
     def gradient_mask(self, functional: bool, capturing: Callable[[], bool]) -> GradientMask:
         return (FunctionalGradient if functional else AccumulatedGradient)(self, capturing)

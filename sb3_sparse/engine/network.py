@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch as th
 from torch import nn
@@ -13,6 +13,7 @@ from sb3_sparse.engine.layers import SparseLayer
 from sb3_sparse.engine.masked import MaskedLayer
 from sb3_sparse.sparsity.distributions import active_counts
 from sb3_sparse.sparsity.initialisation import random_mask, sparsity_aware_weights
+from sb3_sparse.topology import Moment, TopologyMethod
 
 
 class SparseNetwork:
@@ -68,6 +69,16 @@ class SparseNetwork:
         """Set to 0 what masks have inactive."""
         for layer in self.sparse_layers:
             layer.remask()
+
+    def notice(self) -> None:
+        """The same, where torch has counted a write since."""
+        for layer in self.sparse_layers:
+            layer.notice()
+
+    def trust(self) -> None:
+        """What torch has counted just now kept to the masks, as an optimizer's step does."""
+        for layer in self.sparse_layers:
+            layer.trust()
 
     def settle(self, soft_targets: bool) -> None:
         """Bring weights and targets in line with the masks before a round of training.
@@ -131,3 +142,47 @@ class SparseNetwork:
         return {
             layer.name: masks[layer.name].take() for layer in self.layers if layer.name in masks
         }
+
+    def move(
+        self,
+        method: TopologyMethod,
+        moment: Moment,
+        gradients: Mapping[str, th.Tensor | None],
+        optimizers: Sequence[th.optim.Optimizer],
+        soft_targets: bool,
+        at_once: bool,
+    ) -> None:
+        """Move the masks of all layers that are trained.
+
+        :param method: says what to exchange
+        :param moment: when it is
+        :param gradients: dense gradients by layer name
+        :param optimizers: whose moments follow
+        :param soft_targets: whether targets follow at once
+        :param at_once: whether the gradients are those of the step that is about to be taken
+        """
+        nnz = self.nnz
+        dropped = grown = 0
+        for layer in self.layers:
+            if layer.frozen:
+                continue
+            gradient = gradients.get(layer.name)
+            dense_grad = None
+            if method.needs_gradient:
+                if gradient is None:
+                    continue
+                dense_grad = gradient.detach().cpu().numpy().ravel()
+            exchange = method.exchange(layer, moment, dense_grad=dense_grad)
+            if not exchange:
+                continue
+            layer.move(
+                exchange,
+                optimizers,
+                soft_targets=soft_targets,
+                dense_grad=gradient if at_once else None,
+            )
+            dropped += exchange.dropped.size
+            grown += exchange.grown.size
+        if dropped or grown:
+            self.mask_updates += 1
+            self.churn = dropped / nnz

@@ -22,8 +22,16 @@ ACTOR = ("mlp_extractor.policy_net", "action_net")
 CRITIC = ("mlp_extractor.value_net", "value_net")
 
 
-class NoSuchPart(UnsupportedError, AttributeError):
-    """Another algorithm's policy has the attribute, and a sparse one has not."""
+class Absent:
+    """A part that another algorithm's policy has, and a sparse one has not."""
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):  # somebody looks at it from outside
+            raise AttributeError(name)
+        raise UnsupportedError(
+            "RecurrentPPO has no sparse policy, since an LSTM cannot be masked; PPO, A2C and TRPO "
+            "have one"
+        )
 
 
 class SparseActorCriticPolicy(SparsePolicyMixin, ActorCriticPolicy):
@@ -42,6 +50,8 @@ class SparseActorCriticPolicy(SparsePolicyMixin, ActorCriticPolicy):
         ),
     }
     functional_gradients = True  # TRPO's actor; SB3 does not say which algorithm builds the policy
+    lstm_actor = Absent()
+    """What RecurrentPPO asks for first, before it checks the class."""
     _shortcuts: Mapping[str, Shortcut] = {}
 
     def _quicken(self) -> None:
@@ -64,7 +74,7 @@ class SparseActorCriticPolicy(SparsePolicyMixin, ActorCriticPolicy):
         self, obs: Any, deterministic: bool = False
     ) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
         """As in SB3: actions, values of shape ``(n, 1)`` and log probabilities ``(n,)``."""
-        results = self._actor_and_critic(obs)
+        results = self._actor_and_critic(obs) if self._shortcuts else None
         acted = None if results is None else self._act(results[0], deterministic)
         if results is None or acted is None:
             return super().forward(obs, deterministic)
@@ -105,14 +115,6 @@ class SparseActorCriticPolicy(SparsePolicyMixin, ActorCriticPolicy):
         if isinstance(self.action_dist, QuickCategorical):
             return self.action_dist.act(result, deterministic)
         return None
-
-    def __getattr__(self, name: str) -> Any:
-        if name == "lstm_actor":  # what RecurrentPPO asks for first, before it checks the class
-            raise NoSuchPart(
-                "RecurrentPPO has no sparse policy, since an LSTM cannot be masked; PPO, A2C and "
-                "TRPO have one"
-            )
-        return super().__getattr__(name)
 
     def _initial_gain(self, layer_name: str) -> float:
         if not self.ortho_init:

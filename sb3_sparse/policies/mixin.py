@@ -191,10 +191,10 @@ class SparsePolicyMixin(Acts):
         if mode:
             self.sparse.begin_training(self)
         else:
-            self.sparse.enforce()  # before anybody acts with what others have written
+            self.sparse.notice()  # before anybody acts with what others have written
 
     def _enforce(self) -> None:
-        self.sparse.enforce()
+        self.sparse.notice()
 
     def _prepare_to_act(self, count: int) -> bool:
         if not self._switch(False):

@@ -98,7 +98,7 @@ class ActingPart(SparsePart, Acts):
     def _enforce(self) -> None:
         for module in self.modules():
             if (layer := MaskedLayer.of(module)) is not None:
-                layer.remask()
+                layer.notice()
 
 
 def without_graphs(root: nn.Module) -> dict[int, Any]:

@@ -246,7 +246,8 @@ def test_inactive_weights_do_not_act_whoever_wrote_them(model, count):
     expected, _ = model.predict(obs, deterministic=True)
     for layer in model.policy.sparse.layers:
         if not layer.compact:
-            layer.weight.data.add_(5.0 * (1 - layer.float_mask))
+            with th.no_grad():
+                layer.weight.add_(5.0 * (1 - layer.float_mask))
     np.testing.assert_allclose(model.predict(obs, deterministic=True)[0], expected, atol=1e-6)
 
 
