@@ -20,7 +20,7 @@ ACTIVATIONS: dict[type[nn.Module], Activation] = {
     nn.Mish: lambda _: (10, 0.0, 0.0),
     nn.Softplus: lambda m: (11, m.beta, m.threshold),
     nn.LeakyReLU: lambda m: (12, m.negative_slope, 0.0),
-    nn.ReLU6: lambda _: (13, 0.0, 6.0),
+    nn.ReLU6: lambda m: (13, m.min_val, m.max_val),
     nn.Hardtanh: lambda m: (13, m.min_val, m.max_val),
     nn.Hardswish: lambda _: (14, 0.0, 0.0),
 }

@@ -8,6 +8,7 @@ from weakref import ref
 
 import torch as th
 from torch import nn
+from torch.autograd import forward_ad
 
 from sb3_sparse.engine.products import Pass, Products
 from sb3_sparse.errors import UnsupportedError
@@ -83,4 +84,5 @@ def watched(x: th.Tensor) -> bool:
         or th._C._get_tracing_state() is not None
         or th._C._len_torch_dispatch_stack() > 0
         or th._C._functorch.peek_interpreter_stack() is not None
+        or forward_ad._current_level >= 0
     )

@@ -9,7 +9,10 @@ written it.
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Iterable
+import time
+from collections.abc import Callable, Iterable, Iterator
+from itertools import chain
+from operator import itemgetter
 from typing import Any, NamedTuple
 
 import torch as th
@@ -27,6 +30,9 @@ from sb3_sparse.engine.watch import Watch
 
 MOST_INPUTS = 16
 MOST_STEPS = 64
+TRIES = 1000
+"""How often to look for layers whose connections another thread is moving."""
+HOOKS = itemgetter("_forward_hooks", "_forward_pre_hooks")
 
 
 class Step(NamedTuple):
@@ -46,6 +52,7 @@ class Binding(NamedTuple):
     """Where the tensors lie, ready for the kernels; holds them, so that nobody frees them."""
 
     tensors: list[int]
+    sizes: list[th.Size]
     structures: list[Structure]
     activations: list[tuple[int, float, float]]
     arguments: Any
@@ -69,16 +76,10 @@ class Inference:
         self._compact = [layer for layer in self._layers if isinstance(layer, CompactLinear)]
         self._activations = [step.activation for step in steps if step.activation is not None]
         self._adjustable = [m for m in self._activations if isinstance(m, ADJUSTABLE)]
-        self._hooks = [
-            hooks
-            for module in modules
-            for hooks in (module._forward_hooks, module._forward_pre_hooks)
-        ]
+        self._targets = [layer for layer in self._compact if layer.is_target]
+        self._hooked = list(map(vars, modules))
         self._tensors: list[th.Tensor] = [
-            tensor
-            for layer in self._layers
-            for tensor in (layer.weight, layer.bias, layer._buffers.get(FLOAT_MASK_KEY))
-            if tensor is not None
+            tensor for layer in self._layers for tensor in _tensors_of(layer) if tensor is not None
         ]
         self._binding: Binding | None = None
         self._call = library().sb3_sparse_act
@@ -91,8 +92,7 @@ class Inference:
         :param hooked: modules around them whose hooks would want to see the call
         """
         modules = [*hooked, *modules_of(paths)]
-        patched = any("forward" in vars(module) for module in modules)
-        if not paths or patched or why_missing() is not None:
+        if not paths or any(map(patched, modules)) or why_missing() is not None:
             return None
         steps: list[Step] = []
         places: dict[tuple[int, ...], int] = {}
@@ -111,6 +111,11 @@ class Inference:
                 source = places[key]
             ends.append(source)
         inputs = {step.layer.in_features for step in steps if step.source < 0}
+        if any(
+            step.source >= 0 and step.layer.in_features != steps[step.source].layer.out_features
+            for step in steps
+        ):
+            return None
         if len(steps) > MOST_STEPS or len(set(ends)) < len(ends) or len(inputs) > 1:
             return None
         return cls(steps, ends, modules)
@@ -145,7 +150,7 @@ class Inference:
             features != [self._columns]
             or x.dtype is not th.float32
             or not x.is_cpu
-            or any(self._hooks)
+            or any(chain.from_iterable(map(HOOKS, self._hooked)))
             or th.is_autocast_enabled("cpu")
             or _has_any_global_hook()  # type: ignore[no-untyped-call]
         ):
@@ -167,45 +172,95 @@ class Inference:
 
     def _bound(self) -> Binding | None:
         """Where the tensors lie now; None if the kernels cannot read one."""
+        for target in self._targets:
+            if target.snapshot is not None:
+                return None  # it awaits its copy
         tensors = [tensor.data_ptr() for tensor in self._tensors]
+        sizes = list(map(th.Tensor.size, self._tensors))
         structures = [layer.structure for layer in self._compact]
         activations = [number_of(module) for module in self._adjustable]
         binding = self._binding
         if (
             binding is not None
             and tensors == binding.tensors
+            and sizes == binding.sizes
             and structures == binding.structures
             and activations == binding.activations
             and all(map(th.Tensor.is_contiguous, self._tensors))
         ):
             return binding
-        self._binding = None
-        if not all(_readable(tensor) for tensor in self._tensors):
-            return None
-        if any(layer.snapshot is not None for layer in self._compact):
-            return None  # a target that awaits its copy
-        held = [tensor.detach() for tensor in self._tensors]
-        self._binding = Binding(tensors, structures, activations, self._arguments(), held)
-        return self._binding
+        self._binding = binding = self._bind()
+        return binding
 
-    def _arguments(self) -> Any:
-        """``step_t`` of every step."""
+    def _bind(self) -> Binding | None:
+        """Hold what is there now, for as long as the kernels may read it.
+
+        Another thread may be moving connections: then a layer's structure may for a moment have
+        another size than its values.
+        """
+        for _ in range(TRIES):
+            structures = [layer.structure for layer in self._compact]
+            held = [tensor.detach() for tensor in self._tensors]
+            arguments = self._arguments(iter(structures), iter(held))
+            if arguments is not None:
+                return Binding(
+                    [tensor.data_ptr() for tensor in held],
+                    [tensor.size() for tensor in held],
+                    structures,
+                    [number_of(module) for module in self._adjustable],
+                    arguments,
+                    held,
+                )
+            if not self._compact:
+                break
+            time.sleep(0)
+        return None
+
+    def _arguments(self, structures: Iterator[Structure], held: Iterator[th.Tensor]) -> Any:
+        """``step_t`` of every step; None if a tensor is not what the kernels read.
+
+        :param structures: of the compact layers
+        :param held: tensors in the order of those of the layers
+        """
         fields: list[int] = []
         for number, (layer, activation, source) in enumerate(self._steps):
-            start = column = mask_place = 0
+            shape = layer.out_features, layer.in_features
+            sizes: list[tuple[int, ...]] = [shape, (shape[0],), shape]
+            start = column = 0
             if isinstance(layer, CompactLinear):
-                start, column = layer.structure.addresses[:2]
-            elif (mask := layer._buffers.get(FLOAT_MASK_KEY)) is not None:
-                mask_place = mask.data_ptr()
+                structure = next(structures)
+                start, column = structure.addresses[:2]
+                sizes[0] = (structure.nnz,)
+                if structure.shape != shape:
+                    return None
+            places = []
+            for tensor, size in zip(_tensors_of(layer), sizes, strict=True):
+                place = 0
+                if tensor is not None:
+                    now = next(held)
+                    if now.shape != size or not _readable(now):
+                        return None
+                    place = now.data_ptr()
+                places.append(place)
+            weight, bias, mask = places
             kind, a, b = number_of(activation)
             out = -1
             if number in self._ends:
                 out = self._places[self._ends.index(number)]
-            bias = 0 if layer.bias is None else layer.bias.data_ptr()
-            fields += (layer.out_features, layer.in_features, start, column)
-            fields += (layer.weight.data_ptr(), mask_place, bias, kind, bits_of(a), bits_of(b))
-            fields += (source, out)
+            fields += (*shape, start, column, weight, mask, bias)
+            fields += (kind, bits_of(a), bits_of(b), source, out)
         return (ctypes.c_int64 * len(fields))(*fields)
+
+
+def patched(module: nn.Module) -> bool:
+    """Whether somebody has put a function of his own over one of the methods."""
+    kind = type(module)
+    return any(callable(getattr(kind, name, None)) for name in vars(module))
+
+
+def _tensors_of(layer: nn.Linear) -> tuple[th.Tensor | None, ...]:
+    """Weight, bias and mask."""
+    return layer.weight, layer.bias, layer._buffers.get(FLOAT_MASK_KEY)
 
 
 def _readable(tensor: th.Tensor) -> bool:

@@ -73,6 +73,8 @@ class Pass(NamedTuple):
                         f"contiguous float32 on the CPU, got {parameter.dtype} on "
                         f"{parameter.device} with strides {parameter.stride()}"
                     )
+            if values.numel() != structure.nnz:
+                raise RuntimeError("a layer's connections have changed while it was computing")
             kind, a, b = number_of(self.activations[i])
             arguments += (
                 *structure.shape,

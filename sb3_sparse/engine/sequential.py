@@ -9,7 +9,7 @@ import torch as th
 from torch import nn
 from torch.nn.modules.module import _has_any_global_hook
 
-from sb3_sparse.engine.activations import ACTIVATIONS, tells_its_slope
+from sb3_sparse.engine.activations import ACTIVATIONS, ADJUSTABLE, tells_its_slope
 from sb3_sparse.engine.chains import Chain, watched
 from sb3_sparse.engine.inference import KeptInference
 from sb3_sparse.engine.linear import CompactLinear
@@ -28,10 +28,12 @@ class ChainedSequential(nn.Sequential):
 
     _seen: tuple[nn.Module, ...]
     _steps: list[tuple[Any, bool, bool]]
+    _adjustable: list[nn.Module]
+    """Activations within the chains whose parameters may be set anew."""
     _kept: KeptInference
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_seen": (), "_steps": []}
+        return {**self.__dict__, "_seen": (), "_steps": [], "_adjustable": []}
 
     def forward(self, input: th.Tensor) -> th.Tensor:
         """As of ``Sequential``."""
@@ -39,11 +41,16 @@ class ChainedSequential(nn.Sequential):
             return results[0]
         modules = tuple(self._modules.values())
         hooked = any(getattr(module, hooks) for module in modules for hooks in HOOKS)
+        hooked = hooked or any("forward" in vars(module) for module in modules)
         if hooked or watched(input) or _has_any_global_hook():  # type: ignore[no-untyped-call]
             y: th.Tensor = super().forward(input)  # type: ignore[no-untyped-call]
             return y
-        if modules != self._seen:
+        if modules != self._seen or not all(map(tells_its_slope, self._adjustable)):
             self._seen, self._steps = modules, _steps(modules)
+            fused = (
+                after for step, *_ in self._steps for after in getattr(step, "activations", ())
+            )
+            self._adjustable = [after for after in fused if isinstance(after, ADJUSTABLE)]
         x, batch, lead = input, 0, input.shape[:-1]
         for step, tiled_in, tiled_out in self._steps:
             if not isinstance(step, Chain):
@@ -97,7 +104,7 @@ def chain_up(root: nn.Module) -> None:
         if any(isinstance(child, CompactLinear) for child in module.children()):
             module.__class__ = ChainedSequential
             # More of them may be compact now.
-            vars(module).update(_seen=(), _steps=[], _kept=KeptInference())
+            vars(module).update(_seen=(), _steps=[], _adjustable=[], _kept=KeptInference())
         elif type(module) is ChainedSequential:
             unchain(module)
 
@@ -105,4 +112,4 @@ def chain_up(root: nn.Module) -> None:
 def unchain(module: ChainedSequential) -> None:
     """Make it a plain ``Sequential`` again, in place."""
     module.__class__ = nn.Sequential  # type: ignore[assignment]
-    del module._seen, module._steps, module._kept
+    del module._seen, module._steps, module._adjustable, module._kept

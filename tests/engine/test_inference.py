@@ -344,3 +344,41 @@ def test_squashed_actions_are_those_of_the_formula(mean, log_std, noise):
     assert not squashed(means, log_stds, (-20, 2), None, made)
     np.testing.assert_allclose(made, th.stack([means, means.tanh()]), rtol=1e-6)
     assert squashed(th.full((1, 2), th.nan), log_stds, (-20, 2), None, made)
+
+
+def test_layers_that_do_not_fit_each_other_are_left_to_the_modules():
+    net = nn.Sequential(nn.Linear(3, 4), nn.ReLU(), nn.Linear(5, 2))
+    assert Inference.of([[net]]) is None
+
+
+@pytest.mark.parametrize("storage", ["masked", "compact"])
+def test_weights_of_another_size_are_never_read(storage):
+    net = network([5, 6, 3], [storage], nn.Tanh)
+    found = Inference.of([[net]])
+    x = th.randn(2, 5)
+    assert found(x) is not None
+    whole = net[2].weight.data
+    net[2].weight.data = whole.reshape(-1)[:2]
+    assert found._bound() is None
+    net[2].weight.data = whole
+    assert found(x) is not None
+
+
+def test_a_target_that_awaits_its_copy_is_left_to_its_module():
+    layer = nn.Linear(4, 3)
+    dense = layer.weight.detach().clone()
+    mask = np.arange(12) % 2 == 0
+    target = CompactLinear.convert(layer, Structure.of_mask(mask, (3, 4)), is_target=True)
+    assert target.snapshot is not None  # it still has weights that the mask has not
+    found = Inference.of([[target]])
+    assert found(th.randn(1, 4)) is None
+    target.take(target.structure, dense)
+    assert found(th.randn(1, 4)) is not None
+    target.await_copy(Structure.of_mask(~mask, (3, 4)))
+    assert found(th.randn(1, 4)) is None
+
+
+def test_a_method_that_was_patched_is_called():
+    net = network([5, 4, 3], ["compact"], nn.Tanh)
+    net[2].forward = lambda x: x[:, :3]
+    assert Inference.of([[net]]) is None
