@@ -125,6 +125,15 @@ class Inference:
         """Whether its tensors are where the kernels can read them."""
         return self._tensors[0].is_cpu
 
+    @property
+    def watched(self) -> bool:
+        """Whether somebody wants to see the modules called, or in another precision."""
+        return (
+            any(chain.from_iterable(map(HOOKS, self._hooked)))
+            or th.is_autocast_enabled("cpu")
+            or bool(_has_any_global_hook())  # type: ignore[no-untyped-call]
+        )
+
     def __call__(self, x: th.Tensor) -> list[th.Tensor] | None:
         """Each network's result, shape ``(n, its outputs)``, without a graph.
 
@@ -146,14 +155,7 @@ class Inference:
 
     def _results(self, x: th.Tensor) -> list[th.Tensor] | None:
         n, *features = x.shape
-        if (
-            features != [self._columns]
-            or x.dtype is not th.float32
-            or not x.is_cpu
-            or any(chain.from_iterable(map(HOOKS, self._hooked)))
-            or th.is_autocast_enabled("cpu")
-            or _has_any_global_hook()  # type: ignore[no-untyped-call]
-        ):
+        if features != [self._columns] or x.dtype is not th.float32 or not x.is_cpu or self.watched:
             return None
         binding = self._bound()
         if binding is None:
@@ -195,8 +197,7 @@ class Inference:
     def _bind(self) -> Binding | None:
         """Hold what is there now, for as long as the kernels may read it.
 
-        Another thread may be moving connections: then a layer's structure may for a moment have
-        another size than its values.
+        While another thread moves connections a structure may not fit its values for a moment.
         """
         for _ in range(TRIES):
             structures = [layer.structure for layer in self._compact]

@@ -175,6 +175,8 @@ class Shortcut:
             return None
         if root._takes_vectors and type(extractor) is FlattenExtractor:
             return inference(obs.float().flatten(1))
+        if inference.watched:
+            return None  # before the extractor is called, which would be called twice
         return inference(BaseModel.extract_features(root, obs, extractor))
 
 

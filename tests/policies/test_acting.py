@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import pickle
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
@@ -199,8 +200,6 @@ def test_observations_of_any_type_give_the_same(kind):
     "kind", [spaces.MultiDiscrete([3, 2]), spaces.MultiBinary(3), spaces.Discrete(4)]
 )
 def test_other_actions_and_observations_of_an_actor_critic(kind):
-    import gymnasium as gym
-
     class Task(gym.Env):
         observation_space, action_space = spaces.Discrete(5), kind
 
@@ -321,3 +320,19 @@ def test_a_module_with_a_mode_of_its_own_keeps_it():
         assert not modes.switch(net, net.train, mode)
         assert net.training is net[0].training is mode
         assert net[1].training is False
+
+
+@pytest.mark.parametrize("name", ["SAC", "DQN", "PPO"])
+def test_an_extractor_is_called_once_whoever_watches(name):
+    env = gym.make("TinyImages-v0", discrete=name == "DQN")
+    model = make(name, env=env, policy_kwargs=WIDE)
+    policy = {"SAC": "actor", "DQN": "q_net"}.get(name)
+    part = getattr(model.policy, policy) if policy else model.policy
+    called = []
+    handles = [part.features_extractor.cnn[0].register_forward_hook(lambda *_: called.append(1))]
+    model.predict(env.observation_space.sample())
+    assert len(called) == 1
+    last = [m for m in part.modules() if isinstance(m, nn.Linear)][-1]
+    handles.append(last.register_forward_hook(lambda *_: None))
+    model.predict(env.observation_space.sample())
+    assert len(called) == 2
