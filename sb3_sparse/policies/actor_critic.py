@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NoReturn
 
 import torch as th
 from stable_baselines3.common.distributions import DiagGaussianDistribution, Distribution
@@ -20,18 +20,6 @@ from sb3_sparse.policies.spec import NetworkSpec
 
 ACTOR = ("mlp_extractor.policy_net", "action_net")
 CRITIC = ("mlp_extractor.value_net", "value_net")
-
-
-class Absent:
-    """A part that another algorithm's policy has, and a sparse one has not."""
-
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("__"):  # somebody looks at it from outside
-            raise AttributeError(name)
-        raise UnsupportedError(
-            "RecurrentPPO has no sparse policy, since an LSTM cannot be masked; PPO, A2C and TRPO "
-            "have one"
-        )
 
 
 class SparseActorCriticPolicy(SparsePolicyMixin, ActorCriticPolicy):
@@ -50,9 +38,18 @@ class SparseActorCriticPolicy(SparsePolicyMixin, ActorCriticPolicy):
         ),
     }
     functional_gradients = True  # TRPO's actor; SB3 does not say which algorithm builds the policy
-    lstm_actor = Absent()
-    """What RecurrentPPO asks for first, before it checks the class."""
     _shortcuts: Mapping[str, Shortcut] = {}
+
+    @property
+    def lstm_actor(self) -> NoReturn:
+        """What RecurrentPPO asks for first, before it checks the class.
+
+        :raises UnsupportedError: always
+        """
+        raise UnsupportedError(
+            "RecurrentPPO has no sparse policy, since an LSTM cannot be masked; PPO, A2C and TRPO "
+            "have one"
+        )
 
     def _quicken(self) -> None:
         if self.use_sde:
