@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, NoReturn
+from typing import Any
 
 import torch as th
 from stable_baselines3.common.distributions import DiagGaussianDistribution, Distribution
@@ -20,6 +20,10 @@ from sb3_sparse.policies.spec import NetworkSpec
 
 ACTOR = ("mlp_extractor.policy_net", "action_net")
 CRITIC = ("mlp_extractor.value_net", "value_net")
+
+
+class NoSuchPart(UnsupportedError, AttributeError):
+    """Another algorithm's policy has the attribute, and a sparse one has not."""
 
 
 class SparseActorCriticPolicy(SparsePolicyMixin, ActorCriticPolicy):
@@ -39,17 +43,6 @@ class SparseActorCriticPolicy(SparsePolicyMixin, ActorCriticPolicy):
     }
     functional_gradients = True  # TRPO's actor; SB3 does not say which algorithm builds the policy
     _shortcuts: Mapping[str, Shortcut] = {}
-
-    @property
-    def lstm_actor(self) -> NoReturn:
-        """What RecurrentPPO asks for first, before it checks the class.
-
-        :raises UnsupportedError: always
-        """
-        raise UnsupportedError(
-            "RecurrentPPO has no sparse policy, since an LSTM cannot be masked; PPO, A2C and TRPO "
-            "have one"
-        )
 
     def _quicken(self) -> None:
         if self.use_sde:
@@ -112,6 +105,14 @@ class SparseActorCriticPolicy(SparsePolicyMixin, ActorCriticPolicy):
         if isinstance(self.action_dist, QuickCategorical):
             return self.action_dist.act(result, deterministic)
         return None
+
+    def __getattr__(self, name: str) -> Any:
+        if name == "lstm_actor":  # what RecurrentPPO asks for first, before it checks the class
+            raise NoSuchPart(
+                "RecurrentPPO has no sparse policy, since an LSTM cannot be masked; PPO, A2C and "
+                "TRPO have one"
+            )
+        return super().__getattr__(name)
 
     def _initial_gain(self, layer_name: str) -> float:
         if not self.ortho_init:
