@@ -26,11 +26,11 @@ from sb3_sparse.engine.masked import FLOAT_MASK_KEY, MaskedLayer
 from sb3_sparse.engine.native.library import bits_of, library, why_missing
 from sb3_sparse.engine.paths import Paths, modules_of, parts_of
 from sb3_sparse.engine.structure import Structure
-from sb3_sparse.engine.watch import Watch
+from sb3_sparse.engine.watch import Watch, patched
 
 MOST_INPUTS = 16
 MOST_STEPS = 64
-TRIES = 1000
+TRIES = 100
 """How often to look for layers whose connections another thread is moving."""
 HOOKS = itemgetter("_forward_hooks", "_forward_pre_hooks")
 
@@ -81,6 +81,8 @@ class Inference:
         self._tensors: list[th.Tensor] = [
             tensor for layer in self._layers for tensor in _tensors_of(layer) if tensor is not None
         ]
+        numbers = {id(tensor): number for number, tensor in enumerate(self._tensors)}
+        self._values = [numbers[id(layer.weight)] for layer in self._compact]
         self._binding: Binding | None = None
         self._call = library().sb3_sparse_act
 
@@ -201,21 +203,23 @@ class Inference:
         """
         for _ in range(TRIES):
             structures = [layer.structure for layer in self._compact]
-            held = [tensor.detach() for tensor in self._tensors]
-            arguments = self._arguments(iter(structures), iter(held))
-            if arguments is not None:
-                return Binding(
-                    [tensor.data_ptr() for tensor in held],
-                    [tensor.size() for tensor in held],
-                    structures,
-                    [number_of(module) for module in self._adjustable],
-                    arguments,
-                    held,
-                )
-            if not self._compact:
+            # Not detach(), which lets other threads run while it looks at the tensor.
+            held = [tensor.data for tensor in self._tensors]
+            values = [held[number] for number in self._values]
+            if [len(v) for v in values] == [structure.nnz for structure in structures]:
                 break
             time.sleep(0)
-        return None
+        arguments = self._arguments(iter(structures), iter(held))
+        if arguments is None:
+            return None
+        return Binding(
+            [tensor.data_ptr() for tensor in held],
+            [tensor.size() for tensor in held],
+            structures,
+            [number_of(module) for module in self._adjustable],
+            arguments,
+            held,
+        )
 
     def _arguments(self, structures: Iterator[Structure], held: Iterator[th.Tensor]) -> Any:
         """``step_t`` of every step; None if a tensor is not what the kernels read.
@@ -251,12 +255,6 @@ class Inference:
             fields += (*shape, start, column, weight, mask, bias)
             fields += (kind, bits_of(a), bits_of(b), source, out)
         return (ctypes.c_int64 * len(fields))(*fields)
-
-
-def patched(module: nn.Module) -> bool:
-    """Whether somebody has put a function of his own over one of the methods."""
-    kind = type(module)
-    return any(callable(getattr(kind, name, None)) for name in vars(module))
 
 
 def _tensors_of(layer: nn.Linear) -> tuple[th.Tensor | None, ...]:

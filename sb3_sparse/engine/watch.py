@@ -9,6 +9,12 @@ from typing import Any
 from torch import nn
 
 
+def patched(module: nn.Module) -> bool:
+    """Whether somebody has put a function of his own over one of the methods."""
+    kind = type(module)
+    return any(callable(getattr(kind, name, None)) for name in vars(module))
+
+
 class Watch:
     """Notices when a module gets or loses a child, a tensor or an attribute.
 

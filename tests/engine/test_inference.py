@@ -382,3 +382,55 @@ def test_a_method_that_was_patched_is_called():
     net = network([5, 4, 3], ["compact"], nn.Tanh)
     net[2].forward = lambda x: x[:, :3]
     assert Inference.of([[net]]) is None
+
+
+def test_connections_that_another_thread_moves_are_never_read_halfway():
+    import sys
+    import threading
+
+    random = np.random.default_rng(0)
+    layer = nn.Linear(2000, 500)
+    masks = [random.random((500, 2000)) < density for density in (0.3, 0.001)]
+    structures = [Structure.of_mask(mask, mask.shape) for mask in masks]
+    CompactLinear.convert(layer, structures[0], is_target=False)
+    found, x, results = Inference.of([[layer]]), th.ones(1, 2000), []
+    bounds = [0.5 * np.bincount(np.nonzero(mask)[0], minlength=500).max() for mask in masks]
+    done = threading.Event()
+
+    def act():
+        while not done.is_set():
+            with th.no_grad():
+                results.append(found(x))
+
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    layer.bias.data.zero_()
+    layer.restructure(structures[0], th.full((structures[0].nnz,), 0.5))
+    threads = [threading.Thread(target=act) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    try:
+        for i in range(10000):
+            structure = structures[(i + 1) % 2]
+            layer.restructure(structure, th.full((structure.nnz,), 0.5))
+    finally:
+        done.set()
+        for thread in threads:
+            thread.join()
+        sys.setswitchinterval(before)
+    assert len(results) > 10
+    assert all(result is not None for result in results)
+    most = [float(result[0].max()) for result in results]
+    assert set(most) <= set(bounds)
+
+
+def test_what_the_kernels_cannot_read_costs_no_waiting():
+    net = network([5, 6, 3], ["compact", "plain"], nn.Tanh)
+    net[2].double()
+    found = Inference.of([[net]])
+    x = th.randn(1, 5)
+    tries = []
+    bind = found._arguments
+    found._arguments = lambda *given: tries.append(1) or bind(*given)
+    assert found(x) is None
+    assert tries == [1]
