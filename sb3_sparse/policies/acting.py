@@ -77,7 +77,7 @@ class Acts(SwitchesModes, BasePolicy):
         if (
             type(observation) is not np.ndarray
             or not self._takes_vectors
-            or not _untouched(type(self), ON_THE_WAY)
+            or not untouched(self, ON_THE_WAY)
         ):
             return None
         shape, acts = self.observation_space.shape or (), self.action_space.shape or ()
@@ -115,17 +115,24 @@ class Shortcut:
     """The way from observations to the results of networks, in one call where it can be.
 
     :param paths: modules of each network, from the features to the result, by dotted names
+    :param on_the_way: methods of SB3's that it passes over, besides ``extract_features``; where
+        somebody has one of his own, modules are called one by one
     """
 
-    def __init__(self, paths: tuple[tuple[str, ...], ...]) -> None:
+    def __init__(
+        self, paths: tuple[tuple[str, ...], ...], on_the_way: tuple[str, ...] = ()
+    ) -> None:
         self._paths = paths
+        self._on_the_way = ("extract_features", *on_the_way)
+        self._flat = False
+        self._whole = False
         self._kept = KeptInference()
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Shortcut:
-        return Shortcut(self._paths)
+        return Shortcut(self._paths, self._on_the_way[1:])
 
     def __reduce__(self) -> Any:
-        return Shortcut, (self._paths,)
+        return Shortcut, (self._paths, self._on_the_way[1:])
 
     def inference(self, root: nn.Module) -> Inference | None:
         """What computes the networks at once; None where modules must be called one by one."""
@@ -133,16 +140,15 @@ class Shortcut:
 
     @property
     def found(self) -> bool:
-        """Whether the kernels knew all modules the last time, and on the CPU."""
-        return self._kept.found
+        """Whether the kernels knew all modules with masks the last time, and on the CPU."""
+        return self._kept.found and self._whole
 
     def _find(self, root: nn.Module) -> tuple[Paths, list[nn.Module]]:
-        kind: Any = type(root)
         # Whoever counted on the kernels goes by the modules if they know them no more.
         for module in root.modules():
             if (layer := MaskedLayer.of(module)) is not None:
                 layer.remask()
-        if "extract_features" in vars(root) or not _untouched(kind, ("extract_features",)):
+        if not untouched(root, self._on_the_way):
             return [], [root]
         paths = [[root.get_submodule(name) for name in path] for path in self._paths]
         around = [root]
@@ -150,13 +156,17 @@ class Shortcut:
             for name in path:
                 parts = name.split(".")[:-1]
                 around += [root.get_submodule(".".join(parts[: i + 1])) for i in range(len(parts))]
-        around += [
-            module
-            for name, module in root.named_children()
-            if isinstance(module, BaseFeaturesExtractor)
+        extractors = [
+            module for module in root.children() if isinstance(module, BaseFeaturesExtractor)
         ]
-        around = list({id(module): module for module in around}.values())
+        around = list({id(module): module for module in (*around, *extractors)}.values())
         known = all(type(module).__module__.partition(".")[0] in KNOWN for module in around[1:])
+        self._flat = all(map(_only_flattens, extractors))
+        self._whole = not any(
+            MaskedLayer.of(module) for extractor in extractors for module in extractor.modules()
+        )
+        if self._flat:
+            around += [module for extractor in extractors for module in extractor.children()]
         return paths if known else [], around
 
     def results(
@@ -173,11 +183,27 @@ class Shortcut:
         inference = self.inference(root)
         if inference is None:
             return None
-        if root._takes_vectors and type(extractor) is FlattenExtractor:
+        if root._takes_vectors and self._flat:
             return inference(obs.float().flatten(1))
         if inference.watched:
             return None  # before the extractor is called, which would be called twice
         return inference(BaseModel.extract_features(root, obs, extractor))
+
+
+def _only_flattens(extractor: nn.Module) -> bool:
+    """Whether it does no more than SB3's own for vectors."""
+    flatten: Any = extractor._modules.get("flatten")
+    return (
+        type(extractor) is FlattenExtractor
+        and type(flatten) is nn.Flatten
+        and (flatten.start_dim, flatten.end_dim) == (1, -1)
+    )
+
+
+def untouched(module: nn.Module, names: tuple[str, ...]) -> bool:
+    """Whether neither it nor a subclass of the user's own has a method of these names."""
+    kind: Any = type(module)
+    return vars(module).keys().isdisjoint(names) and _untouched(kind, names)
 
 
 @cache

@@ -12,7 +12,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, NatureCNN
 
 from sb3_sparse.errors import UnsupportedError
-from sb3_sparse.policies.acting import Shortcut
+from sb3_sparse.policies.acting import Shortcut, untouched
 from sb3_sparse.policies.extractors import with_extractor
 from sb3_sparse.policies.mixin import SparsePolicyMixin
 from sb3_sparse.policies.sampling import QuickCategorical, QuickGaussian, quick
@@ -48,9 +48,10 @@ class SparseActorCriticPolicy(SparsePolicyMixin, ActorCriticPolicy):
         if self.use_sde:
             return  # its distribution asks for the actor's features too
         self.action_dist = quick(self.action_dist)
-        self._shortcuts = {"actor": Shortcut((ACTOR,)), "critic": Shortcut((CRITIC,))}
+        acts = ("_get_action_dist_from_latent",)
+        self._shortcuts = {"actor": Shortcut((ACTOR,), acts), "critic": Shortcut((CRITIC,))}
         if self.share_features_extractor:
-            self._shortcuts["both"] = Shortcut((ACTOR, CRITIC))
+            self._shortcuts["both"] = Shortcut((ACTOR, CRITIC), acts)
 
     def _by_kernels(self) -> bool:
         shortcut = self._shortcuts.get("actor")
@@ -94,7 +95,9 @@ class SparseActorCriticPolicy(SparsePolicyMixin, ActorCriticPolicy):
         return super().predict_values(obs) if results is None else results[0]
 
     def _predict(self, observation: Any, deterministic: bool = False) -> th.Tensor:
-        results = self._results("actor", observation, self.pi_features_extractor)
+        results = None
+        if untouched(self, ("get_distribution",)):
+            results = self._results("actor", observation, self.pi_features_extractor)
         acted = None if results is None else self._act(results[0], deterministic)
         return super()._predict(observation, deterministic) if acted is None else acted[0]
 

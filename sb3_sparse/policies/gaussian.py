@@ -76,8 +76,10 @@ class QuickSquashedGaussian(SquashedDiagGaussianDistribution):
         :param log_std: the same shape; brought into SB3's bounds in place
         :return: shape ``(n, dim)``; None if one is not finite
         """
-        noise = None if deterministic else th.randn(mean.shape, dtype=th.float32)
-        made = th.empty((2, *mean.shape), dtype=th.float32)
+        noise = None
+        if not deterministic:
+            noise = th.randn(mean.shape, dtype=th.float32, device="cpu")
+        made = th.empty((2, *mean.shape), dtype=th.float32, device="cpu")
         if squashed(mean, log_std, (LOG_STD_MIN, LOG_STD_MAX), noise, made):
             return None
         self._remember(mean, log_std)
@@ -100,6 +102,7 @@ class GaussianActor(ActingPart):
     """Actor of SAC, TQC and CrossQ."""
 
     paths = (("latent_pi", "mu"), ("latent_pi", "log_std"))
+    on_the_way = ("get_action_dist_params",)
     use_sde: bool
 
     def quicken(self) -> None:

@@ -8,8 +8,10 @@ from typing import Any
 from torch import nn
 
 from sb3_sparse.engine.watch import Watch
+from sb3_sparse.policies.storage import KNOWN
 
 SetMode = Callable[[bool], None]
+SWITCHES = ("train", "set_training_mode")
 
 
 class Modes:
@@ -62,4 +64,7 @@ class Modes:
 
 def _has_own_way(module: nn.Module) -> bool:
     """Whether it does more than set a flag, e.g. stays in evaluation mode for ever."""
-    return type(module).train is not nn.Module.train or "train" in vars(module)
+    if type(module).train is not nn.Module.train or not vars(module).keys().isdisjoint(SWITCHES):
+        return True
+    switch = getattr(type(module), "set_training_mode", None)
+    return switch is not None and switch.__module__.partition(".")[0] not in KNOWN

@@ -67,6 +67,8 @@ class ActingPart(SparsePart, Acts):
 
     paths: ClassVar[tuple[tuple[str, ...], ...]]
     """Each of its networks from the features on, by names of its modules."""
+    on_the_way: ClassVar[tuple[str, ...]] = ()
+    """What SB3's ``forward`` calls besides; one of the user's own gets SB3's."""
     features_extractor: BaseFeaturesExtractor
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
@@ -75,7 +77,7 @@ class ActingPart(SparsePart, Acts):
 
     def quicken(self) -> None:
         """Act by the kernels from now on, where they know how."""
-        self._shortcut = Shortcut(self.paths)
+        self._shortcut = Shortcut(self.paths, self.on_the_way)
 
     @property
     def by_kernels(self) -> bool:

@@ -42,14 +42,22 @@ class QuickGaussian(_MadeLater, DiagGaussianDistribution):
     ) -> tuple[th.Tensor, th.Tensor] | None:
         """Actions and their log probabilities, shapes ``(n, dim)`` and ``(n,)``, without a graph.
 
-        They are those of SB3, of the same random numbers. None if a result is not finite.
+        They are those of SB3, of the same random numbers. None if a result is not finite,
+        or for a ``log_std`` that the kernels cannot read.
 
         :param mean: shape ``(n, dim)``
         :param log_std: shape ``(dim,)``
         """
         n, size = mean.shape
-        noise = None if deterministic else th.randn((n, size), dtype=th.float32)
-        made = th.empty(n * size + n, dtype=th.float32)
+        if (
+            log_std.shape != (size,)
+            or log_std.dtype != th.float32
+            or not log_std.is_cpu
+            or not log_std.is_contiguous()
+        ):
+            return None  # somebody has set another one, and torch knows what to do with it
+        noise = None if deterministic else th.randn((n, size), dtype=th.float32, device="cpu")
+        made = th.empty(n * size + n, dtype=th.float32, device="cpu")
         if gaussian(mean, log_std, noise, made):
             return None
         self.remember(mean, log_std)

@@ -16,7 +16,7 @@ from support import ALGORITHMS, make
 from torch import nn
 from torch.nn import functional
 
-from sb3_sparse import SparseSACPolicy, SparsityCallback
+from sb3_sparse import SparseActorCriticPolicy, SparseSACPolicy, SparsityCallback
 from sb3_sparse.policies.acting import Acts
 from sb3_sparse.policies.modes import Modes
 
@@ -336,3 +336,150 @@ def test_an_extractor_is_called_once_whoever_watches(name):
     handles.append(last.register_forward_hook(lambda *_: None))
     model.predict(env.observation_space.sample())
     assert len(called) == 2
+
+
+def acted(model, count=2):
+    return model.predict(observations(model, count), deterministic=True)[0].tolist()
+
+
+@pytest.mark.parametrize(
+    "log_std",
+    [
+        th.tensor([-1.0], dtype=th.float64),
+        th.tensor(-1.0),
+        th.tensor([[-1.0]]),
+    ],
+    ids=["double", "scalar", "matrix"],
+)
+def test_a_log_std_of_another_type_or_shape_acts_as_in_sb3(log_std):
+    model = make("PPO", policy_kwargs=WIDE)
+    obs = th.as_tensor(observations(model, 3))
+    model.policy.log_std = nn.Parameter(log_std)
+    same(*both_ways(model, lambda: model.policy(obs)))
+
+
+@pytest.mark.parametrize("name", ["PPO", "SAC"])
+def test_the_default_device_of_torch_does_not_count(name):
+    model = make(name, policy_kwargs=WIDE)
+    obs = th.as_tensor(observations(model, 2))
+
+    def act():
+        with th.device("meta"):
+            result = model.policy(obs)
+        return result if isinstance(result, tuple) else (result,)
+
+    assert all(result.is_cpu for result in both_ways(model, act)[0])
+
+
+class OwnDistribution(SparseActorCriticPolicy):
+    def get_distribution(self, obs):
+        mean = super().get_distribution(obs).distribution.mean
+        return self.action_dist.proba_distribution(0.25 + 0.0 * mean, self.log_std)
+
+
+class OwnLatent(SparseActorCriticPolicy):
+    def _get_action_dist_from_latent(self, latent_pi):
+        mean = 0.25 + 0.0 * self.action_net(latent_pi)
+        return self.action_dist.proba_distribution(mean, self.log_std)
+
+
+@pytest.mark.parametrize("policy", [OwnDistribution, OwnLatent])
+def test_a_distribution_of_the_users_own_acts(policy):
+    from stable_baselines3 import PPO
+
+    model = PPO(policy, "Pendulum-v1", policy_kwargs=WIDE)
+    assert acted(model) == [[0.25], [0.25]]
+    if policy is OwnLatent:
+        obs = th.as_tensor(observations(model, 2))
+        with th.no_grad():
+            assert model.policy(obs, True)[0].tolist() == [[0.25], [0.25]]
+            assert model.policy.get_distribution(obs).distribution.mean.tolist() == [[0.25]] * 2
+
+
+@pytest.mark.parametrize("how", ["class", "instance"])
+def test_parameters_of_a_distribution_of_the_users_own_act(how):
+    model = make("SAC", policy_kwargs=WIDE)
+    actor = model.actor
+    kind = type(actor)
+    model.predict(observations(model, 1))
+
+    def params(self, obs):
+        mean, log_std, rest = kind.get_action_dist_params(self, obs)
+        return 0.0 * mean, log_std, rest
+
+    if how == "class":
+        actor.__class__ = type("Own", (kind,), {"get_action_dist_params": params})
+        actor.quicken()
+    else:
+        actor.get_action_dist_params = params.__get__(actor)
+    assert acted(model) == [[0.0], [0.0]]
+
+
+def test_methods_that_predict_calls_may_be_patched():
+    model = make("SAC", policy_kwargs=WIDE)
+    obs = observations(model, 2)
+    expected, _ = model.predict(0.5 * obs, deterministic=True)
+    tensors = model.policy.obs_to_tensor
+    model.policy.obs_to_tensor = lambda observation: tensors(0.5 * observation)
+    np.testing.assert_allclose(model.predict(obs, deterministic=True)[0], expected, rtol=1e-5)
+    model = make("PPO", policy_kwargs=WIDE)
+    model.predict(observations(model, 1))
+    model.policy.mlp_extractor.forward_actor = lambda features: th.zeros(len(features), 24)
+    np.testing.assert_allclose(acted(model, 1), model.policy.action_net.bias[None].detach())
+
+
+def test_what_is_done_to_the_flattening_of_observations_counts():
+    class Nothing(nn.Flatten):
+        def forward(self, x):
+            return 0.0 * super().forward(x)
+
+    model = make("SAC", policy_kwargs=WIDE)
+    obs, seen = observations(model, 2), []
+    model.predict(obs)
+    extractor = model.actor.features_extractor
+    handle = extractor.flatten.register_forward_hook(lambda *_: seen.append(1))
+    model.predict(obs)
+    assert seen == [1]
+    handle.remove()
+    extractor.flatten = Nothing()
+    ours, theirs = both_ways(model, lambda: model.predict(obs, deterministic=True)[:1])
+    same(ours, theirs)
+    assert ours[0][0] == ours[0][1]
+
+
+def test_inactive_weights_of_an_extractor_do_not_act_on_vectors_either():
+    import gymnasium as gym
+
+    class Task(gym.Env):
+        observation_space = spaces.Box(0, 1, (1, 36, 36), np.float32)
+        action_space = spaces.Box(-1, 1, (1,), np.float32)
+
+        def reset(self, *, seed=None, options=None):
+            return self.observation_space.sample(), {}
+
+    kwargs = dict(WIDE, normalize_images=False, compute="masked")
+    model = make("PPO", env=Task(), policy_kwargs=kwargs)
+    obs = observations(model, 2)
+    expected, _ = model.predict(obs, deterministic=True)
+    for layer in model.policy.sparse.layers:
+        with th.no_grad():
+            layer.weight.add_(0.5 * (1 - layer.float_mask))
+    np.testing.assert_allclose(model.predict(obs, deterministic=True)[0], expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("how", ["class", "instance"])
+def test_a_part_that_switches_modes_in_its_own_way_is_asked_each_time(how):
+    model = make("SAC", policy_kwargs=WIDE)
+    kind, asked = type(model.actor), []
+
+    def switch(self, mode):
+        asked.append(mode)
+        kind.set_training_mode(self, mode)
+
+    if how == "class":
+        model.actor.__class__ = type("Own", (kind,), {"set_training_mode": switch})
+    else:
+        model.actor.set_training_mode = switch.__get__(model.actor)
+    for mode in (False, True, False):
+        model.policy.set_training_mode(mode)
+        assert asked.pop() is mode
