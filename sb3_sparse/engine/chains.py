@@ -62,12 +62,14 @@ class Chain:
     def run(self, x: th.Tensor, batch: int, tiled_in: bool, tiled_out: bool) -> th.Tensor:
         """The layers on rows ``(batch, columns)`` or tiles, giving rows or tiles."""
         structures, parameters = [], []
+        seen = watched(x)
+        acting = not seen and not th.is_grad_enabled()
         for layer in self.layers:
-            structure, values = layer.live()
+            structure, values = layer.held() if acting else layer.live()
             structures.append(structure)
             parameters += [values, layer.bias]
         how = Pass(self.activations, structures, self._references, batch, tiled_in, tiled_out)
-        if watched(x):
+        if seen:
             return how.by_dense_weights(x, parameters)
         if th.is_grad_enabled() and (
             x.requires_grad or any(p is not None and p.requires_grad for p in parameters)

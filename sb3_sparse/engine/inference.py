@@ -21,7 +21,7 @@ from torch.nn.modules.module import _has_any_global_hook
 
 from sb3_sparse.engine.activations import ADJUSTABLE, number_of
 from sb3_sparse.engine.chains import watched
-from sb3_sparse.engine.linear import CompactLinear
+from sb3_sparse.engine.linear import TRIES, CompactLinear
 from sb3_sparse.engine.masked import FLOAT_MASK_KEY, MaskedLayer
 from sb3_sparse.engine.native.library import bits_of, library, why_missing
 from sb3_sparse.engine.paths import Paths, modules_of, parts_of
@@ -30,8 +30,6 @@ from sb3_sparse.engine.watch import Watch, patched
 
 MOST_INPUTS = 16
 MOST_STEPS = 64
-TRIES = 100
-"""How often to look for layers whose connections another thread is moving."""
 HOOKS = itemgetter("_forward_hooks", "_forward_pre_hooks")
 
 

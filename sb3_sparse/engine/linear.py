@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
@@ -13,6 +14,8 @@ from sb3_sparse.engine.structure import Structure
 from sb3_sparse.errors import UnsupportedError
 
 MASK_KEY = "weight_mask"
+TRIES = 100
+"""How often to look for layers whose connections another thread is moving."""
 
 
 class Listener(Protocol):
@@ -121,6 +124,19 @@ class CompactLinear(nn.Linear):
                 return self.snapshot.structure, self.snapshot.values
             self.snapshot = None  # the online network has been copied or blended in since
         return self.structure, self.weight
+
+    def held(self) -> tuple[Structure, th.Tensor]:
+        """The same without a graph, for threads that act while another moves connections.
+
+        What it returns belongs together and stays in memory.
+        """
+        for _ in range(TRIES):
+            structure, weight = self.live()
+            values = weight.data
+            if len(values) == structure.nnz:
+                break
+            time.sleep(0)
+        return structure, values
 
     def dense(self) -> th.Tensor:
         """The weights, 0 where inactive, shape ``(rows, columns)``."""
