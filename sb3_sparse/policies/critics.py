@@ -11,6 +11,7 @@ from stable_baselines3.common.policies import ContinuousCritic
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
+from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.policies.mixin import SparsePolicyMixin
 from sb3_sparse.policies.parts import ActingPart, SparsePart
 
@@ -76,6 +77,6 @@ class SparseCriticsMixin(SparsePolicyMixin):
         self._acting().quicken()
 
     def _acting(self) -> ActingPart:
-        actor = self.get_submodule("actor")
+        actor = unwrapped(self.get_submodule("actor"))
         assert isinstance(actor, ActingPart)
         return actor

@@ -143,3 +143,14 @@ def test_it_is_compressed(tmp_path):
     outcome = compress(model, envs, tmp_path / "out", sparsity=0.5, steps=64, episodes=2)
     assert outcome.sparsity["actor"] == pytest.approx(0.5, abs=0.01)
     assert type(model).load(outcome.path).policy.sparsity_report().sparsity("actor") > 0.49
+
+
+@pytest.mark.parametrize(("name", "compute"), [("SAC", "masked"), ("TD3", "sparse")])
+def test_an_actor_that_is_compiled_acts_and_trains(name, compute):
+    model = make(name, policy_kwargs=dict(compute=compute))
+    obs = np.stack([model.observation_space.sample() for _ in range(3)])
+    expected, _ = model.predict(obs, deterministic=True)
+    model.actor = model.policy.actor = th.compile(model.policy.actor, backend="eager")
+    np.testing.assert_allclose(model.predict(obs, deterministic=True)[0], expected, atol=1e-6)
+    model.learn(25)
+    assert not np.array_equal(model.predict(obs, deterministic=True)[0], expected)
