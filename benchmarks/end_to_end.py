@@ -59,7 +59,6 @@ CASES: dict[str, list[float]] = {
     "dqn4-impala": [0.0, 0.9],
 }
 """Sparsities by case."""
-GRID_ALGORITHMS = ("sac", "td3", "tqc", "dqn", "dqn4", "ppo", "a2c")
 GRID_WIDTHS = (32, 64, 128, 256, 512, 1024)
 GRID_SPARSITIES = [0.0, 0.5, 0.8, 0.9, 0.95, 0.99]
 FIELDS = [
@@ -255,7 +254,7 @@ def arguments() -> tuple[argparse.Namespace, list[tuple[str, str | None, list[fl
     if args.core is None and cores:
         args.core = max(cores)
     images = [case for case in CASES if case.partition("-")[2] in IMAGES]
-    grid = [f"{algo}-{width}" for algo in GRID_ALGORITHMS for width in GRID_WIDTHS] + images
+    grid = [f"{algo}-{width}" for algo in ALGORITHMS for width in GRID_WIDTHS] + images
     cases = args.cases or (grid if args.grid else list(CASES))
     activations = args.activation or (list(ACTIVATIONS) if args.grid else [None])
     unknown = [name for name in activations if name not in (None, *ACTIVATIONS)]

@@ -30,6 +30,7 @@ from sb3_sparse.engine.watch import Watch, patched
 
 MOST_INPUTS = 16
 MOST_STEPS = 64
+"""``LANES`` and ``MOST_STEPS`` of ``kernels.h``."""
 HOOKS = itemgetter("_forward_hooks", "_forward_pre_hooks")
 
 
@@ -149,7 +150,7 @@ class Inference:
         if results is None:
             # Let the modules compute what the kernels would: without what is inactive.
             for layer in self._layers:
-                if (masked := MaskedLayer.of(layer)) is not None:
+                for masked in MaskedLayer.below(layer):
                     masked.remask()
         return results
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -63,6 +63,11 @@ class MaskedLayer(SparseLayer):
             if isinstance(layer, MaskedLayer) and layer.module is module:
                 return layer
         return None
+
+    @staticmethod
+    def below(root: nn.Module) -> Iterator[MaskedLayer]:
+        """The masked layers of a module and all within it; those of targets are none."""
+        return filter(None, map(MaskedLayer.of, root.modules()))
 
     @property
     def targets(self) -> Sequence[Kernel]:

@@ -12,10 +12,10 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, NatureCNN
 
 from sb3_sparse.errors import UnsupportedError
-from sb3_sparse.policies.acting import Shortcut, untouched
 from sb3_sparse.policies.extractors import with_extractor
 from sb3_sparse.policies.mixin import SparsePolicyMixin
 from sb3_sparse.policies.sampling import QuickCategorical, QuickGaussian, quick
+from sb3_sparse.policies.shortcut import Shortcut, untouched
 from sb3_sparse.policies.spec import NetworkSpec
 
 ACTOR = ("mlp_extractor.policy_net", "action_net")
@@ -53,7 +53,9 @@ class SparseActorCriticPolicy(SparsePolicyMixin, ActorCriticPolicy):
         if self.share_features_extractor:
             self._shortcuts["both"] = Shortcut((ACTOR, CRITIC), acts)
 
-    def _by_kernels(self) -> bool:
+    @property
+    def by_kernels(self) -> bool:
+        """Whether the kernels acted the last time."""
         shortcut = self._shortcuts.get("actor")
         return shortcut is not None and shortcut.found
 

@@ -84,7 +84,9 @@ class SparseQRDQNPolicy(SparsePolicyMixin, QRDQNPolicy):
         kwargs = self._update_features_extractor(self.net_args, features_extractor=None)
         return SparseQuantileNetwork(**kwargs).to(self.device)
 
-    def _by_kernels(self) -> bool:
+    @property
+    def by_kernels(self) -> bool:
+        """Whether the kernels acted the last time."""
         return self.quantile_net.by_kernels
 
     def _quicken(self) -> None:

@@ -70,7 +70,9 @@ class SparseCriticsMixin(SparsePolicyMixin):
         kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
         return self.critic_class(**kwargs).to(self.device)
 
-    def _by_kernels(self) -> bool:
+    @property
+    def by_kernels(self) -> bool:
+        """Whether the kernels acted the last time."""
         return self._acting().by_kernels
 
     def _quicken(self) -> None:

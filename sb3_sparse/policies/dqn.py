@@ -43,7 +43,9 @@ class SparseDQNPolicy(SparsePolicyMixin, DQNPolicy):
         kwargs = self._update_features_extractor(self.net_args, features_extractor=None)
         return SparseQNetwork(**kwargs).to(self.device)
 
-    def _by_kernels(self) -> bool:
+    @property
+    def by_kernels(self) -> bool:
+        """Whether the kernels acted the last time."""
         return self.q_net.by_kernels
 
     def _quicken(self) -> None:

@@ -17,6 +17,7 @@ from torch.autograd.function import once_differentiable
 
 from sb3_sparse.engine.gaussian import squashed
 from sb3_sparse.policies.parts import ActingPart
+from sb3_sparse.policies.sampling import MadeLater
 
 LOG_OF_ROOT_OF_TWO_PI = 0.5 * math.log(2.0 * math.pi)
 
@@ -54,8 +55,8 @@ class _SampleAndLogProb(th.autograd.Function):
         return grad, grad * spread - grad_log_prob, None
 
 
-class QuickSquashedGaussian(SquashedDiagGaussianDistribution):
-    """SB3's distribution with another ``log_prob_from_params``; everything else is SB3's."""
+class QuickSquashedGaussian(MadeLater, SquashedDiagGaussianDistribution):
+    """SB3's distribution with another ``log_prob_from_params``, and :meth:`act`."""
 
     def log_prob_from_params(
         self, mean_actions: th.Tensor, log_std: th.Tensor
@@ -66,7 +67,7 @@ class QuickSquashedGaussian(SquashedDiagGaussianDistribution):
         )
         if log_prob.isnan().any():  # SB3 says what is wrong
             return super().log_prob_from_params(mean_actions, log_std)
-        self._remember(mean_actions, log_std)
+        self.remember(mean_actions, log_std)
         return action, log_prob
 
     def act(self, mean: th.Tensor, log_std: th.Tensor, deterministic: bool) -> th.Tensor | None:
@@ -82,20 +83,9 @@ class QuickSquashedGaussian(SquashedDiagGaussianDistribution):
         made = th.empty((2, *mean.shape), dtype=th.float32, device="cpu")
         if squashed(mean, log_std, (LOG_STD_MIN, LOG_STD_MAX), noise, made):
             return None
-        self._remember(mean, log_std)
+        self.remember(mean, log_std)
         self.gaussian_actions, actions = made.unbind()
         return actions
-
-    def _remember(self, mean_actions: th.Tensor, log_std: th.Tensor) -> None:
-        self._mean, self._log_std = mean_actions, log_std
-        vars(self).pop("distribution", None)  # of other observations
-
-    def __getattr__(self, name: str) -> Any:
-        # Made when somebody asks for it, which training does not.
-        if name != "distribution" or "_mean" not in vars(self):
-            raise AttributeError(name)
-        self.proba_distribution(self._mean, self._log_std)
-        return vars(self)["distribution"]
 
 
 class GaussianActor(ActingPart):

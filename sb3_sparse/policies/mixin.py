@@ -14,7 +14,6 @@ from stable_baselines3.common.type_aliases import Schedule
 
 from sb3_sparse.engine.auto import AutoCompute
 from sb3_sparse.engine.controller import Controller
-from sb3_sparse.engine.inference import MOST_INPUTS
 from sb3_sparse.engine.linear import check_conversion
 from sb3_sparse.engine.optimizers import check_weight_decay, prefer_fused
 from sb3_sparse.engine.places import check_places
@@ -186,8 +185,7 @@ class SparsePolicyMixin(Acts):
 
     def set_training_mode(self, mode: bool) -> None:
         """As in SB3. Every ``train()`` calls it first: here a copied policy gets its hooks back."""
-        if not self._switch(mode):
-            check_places(self, self.sparse.layers)
+        self._switch(mode)
         if mode:
             self.sparse.begin_training(self)
         else:
@@ -196,17 +194,11 @@ class SparsePolicyMixin(Acts):
     def _enforce(self) -> None:
         self.sparse.notice()
 
-    def _prepare_to_act(self, count: int) -> bool:
-        if not self._switch(False):
+    def _switch(self, mode: bool) -> bool:
+        same = super()._switch(mode)
+        if not same:
             check_places(self, self.sparse.layers)
-        if self._by_kernels() and count <= MOST_INPUTS:
-            return True
-        self._enforce()
-        return False
-
-    def _by_kernels(self) -> bool:
-        """Whether the kernels acted the last time."""
-        raise NotImplementedError
+        return same
 
     def parameters_to_vector(self) -> np.ndarray[Any, Any]:
         """As in SB3; kernels are dense in every storage, 0 where inactive."""

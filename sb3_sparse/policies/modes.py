@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from stable_baselines3.common.policies import BaseModel
 from torch import nn
 
 from sb3_sparse.engine.watch import Watch
@@ -68,3 +69,22 @@ def _has_own_way(module: nn.Module) -> bool:
         return True
     switch = getattr(type(module), "set_training_mode", None)
     return switch is not None and switch.__module__.partition(".")[0] not in KNOWN
+
+
+class SwitchesModes(BaseModel):
+    """A policy or part of one that is put into training mode without a walk over its modules."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self._modes = Modes()
+
+    def set_training_mode(self, mode: bool) -> None:
+        """As in SB3."""
+        self._switch(mode)
+
+    def _switch(self, mode: bool) -> bool:
+        """Set the mode; whether all modules were the same as at the last switch.
+
+        :param mode: True for training
+        """
+        return self._modes.switch(self, super().set_training_mode, mode)

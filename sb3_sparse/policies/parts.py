@@ -12,10 +12,11 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
 from sb3_sparse.engine.foreign import Guard
-from sb3_sparse.engine.inference import MOST_INPUTS
 from sb3_sparse.engine.masked import MaskedLayer
 from sb3_sparse.engine.plain import make_plain
-from sb3_sparse.policies.acting import Acts, Shortcut, SwitchesModes
+from sb3_sparse.policies.acting import Acts
+from sb3_sparse.policies.modes import SwitchesModes
+from sb3_sparse.policies.shortcut import Shortcut
 from sb3_sparse.policies.vectors import from_vector, to_vector
 
 WHOLE_POLICY = "a whole policy is copied"
@@ -31,7 +32,7 @@ class SparsePart(SwitchesModes):
         memo[id(self)] = twin
         twin.__dict__.update(copy.deepcopy(self.__dict__, memo))
         if WHOLE_POLICY not in memo:  # whose controller looks after its parts
-            vars(twin)["guard"] = Guard(filter(None, map(MaskedLayer.of, twin.modules())))
+            vars(twin)["guard"] = Guard(MaskedLayer.below(twin))
         return twin
 
     def __getstate__(self) -> dict[str, Any]:
@@ -90,17 +91,9 @@ class ActingPart(SparsePart, Acts):
             return None
         return self._shortcut.results(self, obs, self.features_extractor)
 
-    def _prepare_to_act(self, count: int) -> bool:
-        self.set_training_mode(False)
-        if self.by_kernels and count <= MOST_INPUTS:
-            return True
-        self._enforce()
-        return False
-
     def _enforce(self) -> None:
-        for module in self.modules():
-            if (layer := MaskedLayer.of(module)) is not None:
-                layer.notice()
+        for layer in MaskedLayer.below(self):
+            layer.notice()
 
 
 def without_graphs(root: nn.Module) -> dict[int, Any]:
@@ -121,6 +114,8 @@ def _without_graph(distribution: Distribution) -> Distribution:
     for name, value in vars(twin).items():
         if isinstance(value, th.Tensor):
             setattr(twin, name, value.detach())
+        elif isinstance(value, tuple):  # of a distribution that is made later
+            setattr(twin, name, tuple(part.detach() for part in value))
         elif name in ("distribution", "weights_dist"):
             setattr(twin, name, None)
     return twin

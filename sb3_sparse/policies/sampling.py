@@ -14,16 +14,12 @@ from stable_baselines3.common.distributions import (
 from sb3_sparse.engine.gaussian import gaussian
 
 
-class _MadeLater:
+class MadeLater:
     """Makes ``distribution`` when somebody asks for it, out of the last parameters."""
-
-    def __init__(self, action_dim: int) -> None:
-        super().__init__(action_dim)  # type: ignore[call-arg]
-        self._last: tuple[th.Tensor, ...] | None = None
 
     def remember(self, *parameters: th.Tensor) -> None:
         """Be the distribution of these parameters of SB3's ``proba_distribution``."""
-        self._last = tuple(parameter.detach() for parameter in parameters)
+        self._last = parameters
         vars(self).pop("distribution", None)
 
     def __getattr__(self, name: str) -> Any:
@@ -34,7 +30,7 @@ class _MadeLater:
         return vars(self)["distribution"]
 
 
-class QuickGaussian(_MadeLater, DiagGaussianDistribution):
+class QuickGaussian(MadeLater, DiagGaussianDistribution):
     """SB3's distribution for PPO and A2C with another :meth:`act`; everything else is SB3's."""
 
     def act(
@@ -60,11 +56,11 @@ class QuickGaussian(_MadeLater, DiagGaussianDistribution):
         made = th.empty(n * size + n, dtype=th.float32, device="cpu")
         if gaussian(mean, log_std, noise, made):
             return None
-        self.remember(mean, log_std)
+        self.remember(mean, log_std.detach())
         return made.as_strided((n, size), (size, 1), 0), made.as_strided((n,), (1,), n * size)
 
 
-class QuickCategorical(_MadeLater, CategoricalDistribution):
+class QuickCategorical(MadeLater, CategoricalDistribution):
     """SB3's distribution for PPO and A2C with another :meth:`act`; everything else is SB3's."""
 
     def act(self, logits: th.Tensor, deterministic: bool) -> tuple[th.Tensor, th.Tensor] | None:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch as th
 import torch.fx.experimental.proxy_tensor
+from engine_support import largest_while_moving
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import nn
@@ -39,14 +40,6 @@ ELEMENTWISE = [
     nn.GELU,
     nn.Softplus,
 ]
-
-
-@pytest.fixture(params=library.instruction_sets())
-def instructions(request):
-    before = library.in_use()
-    library.use(request.param)
-    yield request.param
-    library.use(before)
 
 
 @pytest.fixture
@@ -405,39 +398,9 @@ def chained(*modules: nn.Module) -> nn.Sequential:
 
 
 def test_a_batch_goes_through_while_another_thread_moves_connections():
-    import sys
-    import threading
-
-    random = np.random.default_rng(0)
-    layer = nn.Linear(300, 50)
-    masks = [random.random((50, 300)) < density for density in (0.5, 0.01)]
-    structures = [Structure.of_mask(mask, mask.shape) for mask in masks]
-    CompactLinear.convert(layer, structures[0], is_target=False)
-    layer.bias.data.zero_()
-    layer.restructure(structures[0], th.full((structures[0].nnz,), 0.5))
-    bounds = {0.5 * np.bincount(np.nonzero(mask)[0]).max() for mask in masks}
-    results, errors, done = [], [], threading.Event()
-
-    def act():
-        while not done.is_set():
-            try:
-                with th.no_grad():
-                    results.append(float(layer(th.ones(20, 300)).max()))
-            except Exception as error:
-                errors.append(error)
-
-    before = sys.getswitchinterval()
-    sys.setswitchinterval(1e-6)
-    thread = threading.Thread(target=act)
-    thread.start()
-    try:
-        for i in range(10000):
-            structure = structures[(i + 1) % 2]
-            layer.restructure(structure, th.full((structure.nnz,), 0.5))
-    finally:
-        done.set()
-        thread.join()
-        sys.setswitchinterval(before)
-    assert not errors
-    assert len(results) > 10
-    assert set(results) <= bounds
+    x = th.ones(20, 300)
+    found, allowed = largest_while_moving(
+        (50, 300), (0.5, 0.01), lambda layer: lambda: layer(x), threads=1
+    )
+    assert len(found) > 10
+    assert set(found) <= allowed

@@ -9,6 +9,7 @@ from functools import partial
 import numpy as np
 import pytest
 import torch as th
+from engine_support import largest_while_moving
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import nn
@@ -32,14 +33,6 @@ ELEMENTWISE = [
     partial(nn.Hardtanh, -0.5, 0.75),
 ]
 STORAGES = ("plain", "masked", "compact")
-
-
-@pytest.fixture(params=library.instruction_sets())
-def instructions(request):
-    before = library.in_use()
-    library.use(request.param)
-    yield request.param
-    library.use(before)
 
 
 def stored(layer: nn.Linear, storage: str, density: float, random: np.random.Generator):
@@ -385,43 +378,13 @@ def test_a_method_that_was_patched_is_called():
 
 
 def test_connections_that_another_thread_moves_are_never_read_halfway():
-    import sys
-    import threading
+    def actor_of(layer):
+        inference, x = Inference.of([[layer]]), th.ones(1, 2000)
+        return lambda: inference(x)[0]
 
-    random = np.random.default_rng(0)
-    layer = nn.Linear(2000, 500)
-    masks = [random.random((500, 2000)) < density for density in (0.3, 0.001)]
-    structures = [Structure.of_mask(mask, mask.shape) for mask in masks]
-    CompactLinear.convert(layer, structures[0], is_target=False)
-    found, x, results = Inference.of([[layer]]), th.ones(1, 2000), []
-    bounds = [0.5 * np.bincount(np.nonzero(mask)[0], minlength=500).max() for mask in masks]
-    done = threading.Event()
-
-    def act():
-        while not done.is_set():
-            with th.no_grad():
-                results.append(found(x))
-
-    before = sys.getswitchinterval()
-    sys.setswitchinterval(1e-6)
-    layer.bias.data.zero_()
-    layer.restructure(structures[0], th.full((structures[0].nnz,), 0.5))
-    threads = [threading.Thread(target=act) for _ in range(2)]
-    for thread in threads:
-        thread.start()
-    try:
-        for i in range(10000):
-            structure = structures[(i + 1) % 2]
-            layer.restructure(structure, th.full((structure.nnz,), 0.5))
-    finally:
-        done.set()
-        for thread in threads:
-            thread.join()
-        sys.setswitchinterval(before)
-    assert len(results) > 10
-    assert all(result is not None for result in results)
-    most = [float(result[0].max()) for result in results]
-    assert set(most) <= set(bounds)
+    found, allowed = largest_while_moving((500, 2000), (0.3, 0.001), actor_of, threads=2)
+    assert len(found) > 10
+    assert set(found) <= allowed
 
 
 def test_what_the_kernels_cannot_read_costs_no_waiting():

@@ -88,3 +88,12 @@ def test_second_derivatives_are_refused():
     (first,) = th.autograd.grad(log_prob.sum(), mean, create_graph=True)
     with pytest.raises(RuntimeError, match="does not require grad|once_differentiable"):
         first.sum().backward()
+
+
+def test_the_last_distribution_keeps_its_graph_and_the_actor_can_be_copied():
+    model = make("SAC", policy_kwargs=dict(sparsity=0.5))
+    actor = model.policy.actor
+    actor.action_log_prob(th.as_tensor(model.observation_space.sample()[None]))
+    twin = copy.deepcopy(actor)
+    assert not twin.action_dist.distribution.mean.requires_grad
+    assert actor.action_dist.distribution.mean.requires_grad

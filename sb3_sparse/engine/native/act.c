@@ -108,6 +108,7 @@ static void several(const step_t *step, int64_t batch, const float *x, float *y)
             dense_rows(N, step, x + at, y + at);                                            \
         j += N;                                                                             \
     }
+        /* What is not of this WIDTH is never run, and compiled for one vector. */
         if (left >= 4 && WIDTH == 4)
             STEP(LANES / WIDTH < 4 ? 1 : 4, 2)
         else if (left >= 2 && WIDTH < 16)
@@ -123,7 +124,7 @@ static int64_t padded(int64_t features) { return (features + LANES - 1) / LANES 
 int NAMED(act, SUFFIX)(const step_t *steps, int64_t count, int64_t batch, const float *x, float *y) {
     int64_t lanes = batch == 1 ? 1 : LANES, size = batch == 1 ? 0 : steps->columns;
     for (int64_t s = 0; s < count; s++) size += padded(steps[s].rows);
-    float *place[64], *next = sb3_sparse_scratch((size_t)(padded(size * lanes) * 4));
+    float *place[MOST_STEPS], *next = sb3_sparse_scratch((size_t)(padded(size * lanes) * 4));
     if (!next) return -1;
     const float *input = x;
     if (batch > 1) {
@@ -131,7 +132,7 @@ int NAMED(act, SUFFIX)(const step_t *steps, int64_t count, int64_t batch, const 
         input = next;
         next += steps->columns * LANES;
     }
-    vec wrong = {0};
+    float wrong = 0; /* NaN as soon as a result is not finite */
     for (int64_t s = 0; s < count; s++) {
         const step_t *step = steps + s;
         const float *from = step->from < 0 ? input : place[step->from];
@@ -148,7 +149,7 @@ int NAMED(act, SUFFIX)(const step_t *steps, int64_t count, int64_t batch, const 
             memcpy(to, place[s], (size_t)step->rows * sizeof *to);
         else
             from_tile(place[s], batch, step->rows, LANES, to);
-        for (int64_t i = 0; i < step->rows * batch; i++) wrong[0] += to[i] - to[i];
+        for (int64_t i = 0; i < step->rows * batch; i++) wrong += to[i] - to[i];
     }
-    return wrong[0] != wrong[0];
+    return wrong != wrong;
 }
