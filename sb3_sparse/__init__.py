@@ -17,6 +17,11 @@ from typing import TYPE_CHECKING
 from sb3_sparse.lazy import lazily
 
 if TYPE_CHECKING:
+    from sb3_sparse.algorithms.a2c import A2C
+    from sb3_sparse.algorithms.dqn import DQN
+    from sb3_sparse.algorithms.ppo import PPO
+    from sb3_sparse.algorithms.sac import SAC
+    from sb3_sparse.algorithms.td3 import DDPG, TD3
     from sb3_sparse.callback import SparsityCallback
     from sb3_sparse.compress.twin import sparsify
     from sb3_sparse.policies.actor_critic import SparseActorCriticPolicy
@@ -27,6 +32,12 @@ if TYPE_CHECKING:
 
 __version__ = version("sb3-sparse")
 __all__ = [
+    "A2C",
+    "DDPG",
+    "DQN",
+    "PPO",
+    "SAC",
+    "TD3",
     "SparseActorCriticPolicy",
     "SparseDQNPolicy",
     "SparsePolicy",
@@ -42,6 +53,12 @@ if find_spec("sb3_contrib"):
 __getattr__, __dir__ = lazily(
     __name__,
     {
+        "A2C": "algorithms.a2c",
+        "DDPG": "algorithms.td3",
+        "DQN": "algorithms.dqn",
+        "PPO": "algorithms.ppo",
+        "SAC": "algorithms.sac",
+        "TD3": "algorithms.td3",
         "SparseActorCriticPolicy": "policies.actor_critic",
         "SparseDQNPolicy": "policies.dqn",
         "SparsePolicy": "policies.aliases",

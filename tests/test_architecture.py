@@ -15,9 +15,9 @@ FLOORS = [
     {"cli", "rl_zoo_optimize"},
     {"report", "experiments", "tuning"},
     {"zoo", "analysis", "export", "compress", "launch"},
-    {"callback"},
+    {"callback", "algorithms"},
     {"policies"},
-    {"networks", "wrappers", "loading"},
+    {"networks", "wrappers", "loading", "fused"},
     {"engine"},
     {"topology"},
     {"sparsity"},
@@ -29,6 +29,7 @@ FORBIDDEN = {
     "sparsity": {"torch", "stable_baselines3", "sb3_contrib", "gymnasium"},
     "topology": {"torch", "stable_baselines3", "sb3_contrib", "gymnasium"},
     "engine": {"stable_baselines3", "sb3_contrib", "gymnasium"},
+    "fused": {"stable_baselines3", "sb3_contrib", "gymnasium"},
 }
 # Each optional dependency has one edge.
 EDGES = {

@@ -206,7 +206,7 @@ class Controller:
         """Do what is still due and freeze the masks."""
         self.flush()
         for network in self.networks:
-            if self.plan is not None and self._must_finish(network, self.plan):
+            if self.plan is not None and network.must_finish(self.plan, self.progress):
                 self._move(network, self.plan, {})
         self.plan = None
 
@@ -217,18 +217,10 @@ class Controller:
                 self._move(network, self.plan, network.pending)
             network.pending = None
 
-    def _must_finish(self, network: SparseNetwork, plan: Plan) -> bool:
-        return plan.topology.reaches_final and self.progress >= plan.end and network.denser
-
     def _capturing(self, network: SparseNetwork) -> bool:
-        plan = self.plan
-        if plan is None or not (plan.topology.grows or plan.topology.needs_gradient):
-            return False
-        return (
-            self.functional_gradients  # a rollout's actor gradient comes before its steps
-            or (network.clock + 1) % plan.update_interval == 0
-            or self._must_finish(network, plan)
-        )
+        if self.functional_gradients:  # a rollout's actor gradient comes before its steps
+            return self.plan is not None and self.plan.wants_gradients
+        return network.wants_gradients(self.plan, self.progress)
 
     def _before_step(self, optimizer: th.optim.Optimizer, args: object, kwargs: object) -> None:
         self._attach_to_gradients()  # a layer may have been frozen until now
@@ -260,9 +252,38 @@ class Controller:
             if network.optimizer is optimizer:
                 network.remask()
 
+    def awaits(self, optimizer: th.optim.Optimizer) -> bool:
+        """Whether the optimizer's next step is more than a step: masks move at it, say."""
+        return any(
+            network.due(self.plan, network.clock + 1, self.progress)
+            or (self.plan is None and not self._warned and network.denser)
+            or any(layer.moments_stale for layer in network.layers)
+            for network in self.networks
+            if network.optimizer is optimizer
+        )
+
+    def wants_gradients(self, optimizer: th.optim.Optimizer) -> bool:
+        """Whether dense gradients are wanted at the optimizer's next step."""
+        return any(
+            network.wants_gradients(self.plan, self.progress)
+            for network in self.networks
+            if network.optimizer is optimizer
+        )
+
+    def passed(self, optimizer: th.optim.Optimizer) -> None:
+        """Count a step that somebody has taken in the optimizer's place."""
+        for network in self.networks:
+            if network.optimizer is optimizer:
+                network.clock += 1
+
+    def note_gradient(self, layer: SparseLayer, dense_grad: th.Tensor) -> None:
+        """Hear of a layer's dense gradient at the step that is about to be taken."""
+        if layer.name in self._gradient_masks:
+            self._gradient_masks[layer.name].dense_grad = lambda: dense_grad
+
     def _update_if_due(self, network: SparseNetwork, plan: Plan) -> None:
         gradients = network.take_gradients(self._gradient_masks)
-        if plan.due(network.clock, self.progress) or self._must_finish(network, plan):
+        if network.due(plan, network.clock, self.progress):
             self.updates_due += 1
             computed = {name: None if g is None else g() for name, g in gradients.items()}
             if plan.update_on == "step":

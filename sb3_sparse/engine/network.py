@@ -11,6 +11,7 @@ from sb3_sparse.engine.gradients import DenseGradient, GradientMask
 from sb3_sparse.engine.kernels import Kernel
 from sb3_sparse.engine.layers import SparseLayer
 from sb3_sparse.engine.masked import MaskedLayer
+from sb3_sparse.engine.plan import Plan
 from sb3_sparse.sparsity.distributions import active_counts
 from sb3_sparse.sparsity.initialisation import random_mask, sparsity_aware_weights
 from sb3_sparse.topology import Moment, TopologyMethod
@@ -136,6 +137,27 @@ class SparseNetwork:
                 gain = gains[layer.name]
                 weights = sparsity_aware_weights(mask, seed, layer.name, gain)
                 layer.write(th.from_numpy(weights))
+
+    def due(self, plan: Plan | None, step: int, progress: float) -> bool:
+        """Whether masks move at that gradient step.
+
+        :param plan: None: they never move
+        :param step: of the optimizer that owns the network, from 1
+        :param progress: environment steps done / planned
+        """
+        return plan is not None and (plan.due(step, progress) or self.must_finish(plan, progress))
+
+    def must_finish(self, plan: Plan, progress: float) -> bool:
+        """Whether a plan has ended, and the network is still denser than it shall be."""
+        return plan.topology.reaches_final and progress >= plan.end and self.denser
+
+    def wants_gradients(self, plan: Plan | None, progress: float) -> bool:
+        """Whether dense gradients of the next gradient step are wanted."""
+        return (
+            plan is not None
+            and plan.wants_gradients
+            and ((self.clock + 1) % plan.update_interval == 0 or self.must_finish(plan, progress))
+        )
 
     def take_gradients(self, masks: dict[str, GradientMask]) -> dict[str, DenseGradient | None]:
         """Dense gradients of the step that is about to happen, by layer name."""

@@ -57,6 +57,11 @@ class Plan:
         """The method itself."""
         return method_named(self.method)
 
+    @property
+    def wants_gradients(self) -> bool:
+        """Whether an update needs dense gradients, be it for what it grows."""
+        return self.topology.grows or self.topology.needs_gradient
+
     def moment(self, step: int, progress: float, seed: int) -> Moment:
         """The moment that a method is handed."""
         return Moment(step, progress, self.begin, self.end, self.drop_fraction, seed)

@@ -44,9 +44,13 @@ INLINE vec expm1_of(vec x) {
     return scale * rest + (scale - 1);
 }
 
+INLINE vec magnitude(vec x) { return (vec)((ivec)x & 0x7fffffff); }
+
+/* Near 1 it is the distance from 1 that must be right: SAC takes the logarithm of 1 - tanh(x)^2. */
 INLINE vec tanh_of(vec x) {
-    vec t = expm1_of(2 * at_most(at_least(x, -10), 10));
-    return t / (t + 2);
+    vec size = at_most(magnitude(x), 10), t = expm1_of(2 * size);
+    vec y = choose(size > 0.5f, 1 - 2 / (t + 2), t / (t + 2));
+    return (vec)((ivec)y | ((ivec)x & ~0x7fffffff));
 }
 
 INLINE vec one_by_one(vec x, float (*function)(float, float, float), float a, float b) {

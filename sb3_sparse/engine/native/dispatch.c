@@ -1,5 +1,5 @@
 /* Chooses the kernels for the processor at run time. */
-#include "kernels.h"
+#include "fused.h"
 
 #include <math.h>
 #include <pthread.h>
@@ -8,18 +8,23 @@
 
 #if defined(__x86_64__)
 DECLARE(avx512)
+DECLARE_FUSED(avx512)
 DECLARE(avx2)
+DECLARE_FUSED(avx2)
 #endif
 DECLARE(plain)
+DECLARE_FUSED(plain)
 
 typedef struct {
     const char *name;
     void (*forward)(const layer_t *, const batch_t *);
     int (*backward)(const layer_t *, const batch_t *);
     int (*act)(const step_t *, int64_t, int64_t, const float *, float *);
+    int64_t (*fused)(const program_t *, int64_t, int64_t);
 } kernels_t;
 
-#define ENTRY(name, suffix) {name, NAMED(forward, suffix), NAMED(backward, suffix), NAMED(act, suffix)}
+#define ENTRY(name, suffix)                                                                  \
+    {name, NAMED(forward, suffix), NAMED(backward, suffix), NAMED(act, suffix), NAMED(fused, suffix)}
 
 /* The best first. What is plain on aarch64 is NEON, which every such processor has. */
 static const kernels_t all[] = {
@@ -52,7 +57,7 @@ static int runs_here(const kernels_t *kernels) {
 #define EXPORT __attribute__((visibility("default")))
 
 /* Changes with every change of what Python hands over. */
-EXPORT int sb3_sparse_version(void) { return 4; }
+EXPORT int sb3_sparse_version(void) { return 5; }
 
 openmp_t sb3_sparse_openmp;
 
@@ -116,6 +121,11 @@ EXPORT int sb3_sparse_backward(const layer_t *layers, const batch_t *batch) {
 EXPORT int sb3_sparse_act(const step_t *steps, int64_t count, int64_t batch, const float *x,
                           float *y) {
     return chosen->act(steps, count, batch, x, y);
+}
+
+/* Operations first..last of a program; the number of the check that failed, or -1. */
+EXPORT int64_t sb3_sparse_fused(const program_t *program, int64_t first, int64_t last) {
+    return chosen->fused(program, first, last);
 }
 
 /* Actions mean + std * noise (without noise: the mean) of `count` Gaussians of `size` dimensions, and

@@ -1,0 +1,71 @@
+"""A2C."""
+
+from __future__ import annotations
+
+import stable_baselines3
+
+from sb3_sparse.algorithms.on_policy import METHODS, OnPolicy
+from sb3_sparse.fused.errors import NotCovered
+from sb3_sparse.fused.machine import Machine
+from sb3_sparse.fused.program import Program
+
+
+class A2C(OnPolicy, stable_baselines3.A2C):
+    """Stable-Baselines3's A2C; each gradient step of a sparse policy is one call of the kernels."""
+
+    def train(self) -> None:
+        """As in SB3. What programs do not cover, such as images or gSDE, SB3 trains."""
+        try:
+            self._train_fused()
+        except NotCovered as why:
+            self._not_covered(why)
+            super().train()
+
+    def _machine(self) -> Machine:
+        policy = self._trains().check(self.policy, METHODS)
+        batch = self.rollout_buffer.buffer_size * self.rollout_buffer.n_envs
+        key = (self.normalize_advantage, id(policy.optimizer))
+        return self._trains().machine(policy, key, batch, [policy.optimizer], self._record)
+
+    def _record(self, program: Program) -> None:
+        """One gradient step."""
+        values, log_prob, entropy = self._record_policy(program)
+        advantages = program.input("advantages", 1)
+        if self.normalize_advantage:
+            advantages = self._normalised(advantages)
+        policy_loss = -(advantages * log_prob).mean()
+        value_loss = (program.input("returns", 1) - values).square().mean()
+        entropy_loss = -(entropy.mean() if entropy.batched else entropy)
+        for name, loss in (
+            ("policy_loss", policy_loss), ("value_loss", value_loss), ("entropy_loss", entropy_loss)
+        ):  # fmt: skip
+            program.log(name, loss)
+        loss = (
+            policy_loss
+            + program.scalar("ent_coef") * entropy_loss
+            + program.scalar("vf_coef") * value_loss
+        )
+        program.minimise(loss, self.policy.optimizer, clip=program.scalar("max_grad_norm"))
+
+    def _train_fused(self) -> None:
+        self.policy.set_training_mode(True)
+        self._update_learning_rate(self.policy.optimizer)
+        machine = self._machine()
+        machine.prepare()
+        machine.set(
+            {
+                "ent_coef": self.ent_coef,
+                "vf_coef": self.vf_coef,
+                "max_grad_norm": self.max_grad_norm,
+            }
+        )
+        for data in self.rollout_buffer.get(batch_size=None):
+            self._load(machine, data)
+            self._run(machine, data, 0, None)
+        self._n_updates += 1
+        record = self.logger.record
+        record("train/n_updates", self._n_updates, exclude="tensorboard")
+        record("train/explained_variance", self._explained_variance())
+        for name in ("entropy_loss", "policy_loss", "value_loss"):
+            record(f"train/{name}", machine.number(name))
+        self._record_std()

@@ -1,0 +1,105 @@
+"""What PPO and A2C have in common."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
+
+from sb3_sparse.algorithms.training import Fused, features, parts
+from sb3_sparse.engine.native.library import bits_of
+from sb3_sparse.fused.distributions import bernoulli, categorical, gaussian, multi_categorical
+from sb3_sparse.fused.errors import CheckFailed, NotCovered
+from sb3_sparse.fused.machine import Machine
+from sb3_sparse.fused.optimizers import KNOWN, Known
+from sb3_sparse.fused.program import Program
+from sb3_sparse.fused.values import Value
+
+METHODS: dict[str, tuple[str, ...]] = {
+    "": (
+        "evaluate_actions",
+        "extract_features",
+        "_get_action_dist_from_latent",
+    ),
+    "mlp_extractor": ("forward", "forward_actor", "forward_critic"),
+}
+
+
+def _rmsprop(group: dict[str, Any]) -> list[int] | None:
+    if group["momentum"] or group["centered"]:
+        return None
+    numbers = (group["lr"], 0.0, group["alpha"], group["eps"], group["weight_decay"])
+    return [1, *map(bits_of, map(float, numbers)), 0]
+
+
+KNOWN[RMSpropTFLike] = Known(_rmsprop, ("", "square_avg"))
+
+
+class OnPolicy(Fused, OnPolicyAlgorithm):
+    """An algorithm that learns from rollouts."""
+
+    def _record_policy(self, program: Program) -> tuple[Value, Value, Value]:
+        """Values, log probabilities and entropy of a batch of observations and actions."""
+        policy: Any = self.policy
+        both = policy.mlp_extractor
+        obs = program.input("obs", policy.features_dim)
+        values = program.network(parts(both.value_net, policy.value_net), obs)
+        head = program.network(parts(both.policy_net, policy.action_net), obs)
+        program.check(head, "distribution")
+        space = self.action_space
+        if isinstance(space, spaces.Box):
+            log_std = program.parameter(policy.log_std)
+            actions = program.input("actions", head.features)
+            log_prob, entropy = gaussian(head, log_std, actions)
+        elif isinstance(space, spaces.Discrete):
+            log_prob, entropy = categorical(head, program.input("actions", 1))
+        elif isinstance(space, spaces.MultiDiscrete):
+            sizes = [int(size) for size in space.nvec]
+            actions = program.input("actions", len(sizes))
+            log_prob, entropy = multi_categorical(head, actions, sizes)
+        elif isinstance(space, spaces.MultiBinary):
+            log_prob, entropy = bernoulli(head, program.input("actions", head.features))
+        else:
+            raise NotCovered(f"actions of type {type(space).__name__}")
+        return values, log_prob, entropy
+
+    @staticmethod
+    def _normalised(advantages: Value) -> Value:
+        centred = advantages - advantages.mean()
+        return centred / ((centred.square().sum() / advantages.program.scalar("batch - 1")).sqrt()
+                          + 1e-8)  # fmt: skip
+
+    def _load(self, machine: Machine, data: Any) -> None:
+        machine.load(
+            {
+                "obs": features(self.policy, data.observations),
+                "actions": data.actions,
+                "old_values": data.old_values,
+                "old_log_prob": data.old_log_prob,
+                "advantages": data.advantages,
+                "returns": data.returns,
+            }
+        )
+        machine.set({"batch - 1": len(data.advantages) - 1})
+
+    def _run(self, machine: Machine, data: Any, first: int, last: int | None) -> None:
+        try:
+            machine.run(first, last)
+        except CheckFailed:
+            # SB3's distribution refuses what is not finite, and says what it is.
+            self.policy.evaluate_actions(data.observations, data.actions)
+            raise
+
+    def _explained_variance(self) -> Any:
+        from stable_baselines3.common.utils import explained_variance
+
+        buffer = self.rollout_buffer
+        return explained_variance(buffer.values.flatten(), buffer.returns.flatten())
+
+    def _record_std(self) -> None:
+        log_std = getattr(self.policy, "log_std", None)
+        if log_std is not None:
+            self.logger.record("train/std", float(np.exp(log_std.detach().numpy()).mean()))

@@ -1,0 +1,129 @@
+"""PPO."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+
+import numpy as np
+import stable_baselines3
+
+from sb3_sparse.algorithms.on_policy import METHODS, OnPolicy
+from sb3_sparse.fused.errors import NotCovered
+from sb3_sparse.fused.machine import Machine
+from sb3_sparse.fused.program import Program
+
+LOGGED = {
+    "entropy_loss": "train/entropy_loss",
+    "policy_loss": "train/policy_gradient_loss",
+    "value_loss": "train/value_loss",
+    "clip_fraction": "train/clip_fraction",
+}
+
+
+class PPO(OnPolicy, stable_baselines3.PPO):
+    """Stable-Baselines3's PPO; each gradient step of a sparse policy is one call of the kernels."""
+
+    def train(self) -> None:
+        """As in SB3. What programs do not cover, such as images or gSDE, SB3 trains."""
+        try:
+            self._train_fused()
+        except NotCovered as why:
+            self._not_covered(why)
+            super().train()
+
+    def _machine(self, batch: int) -> Machine:
+        policy = self._trains().check(self.policy, METHODS)
+        normalised = self.normalize_advantage and batch > 1
+        clipped = self.clip_range_vf is not None
+        key = (normalised, clipped, id(policy.optimizer))
+        return self._trains().machine(
+            policy, key, max(batch, self.batch_size), [policy.optimizer],
+            lambda program: self._record(program, normalised, clipped),
+        )  # fmt: skip
+
+    def _record(self, program: Program, normalised: bool, clipped: bool) -> None:
+        """One gradient step."""
+        values, log_prob, entropy = self._record_policy(program)
+        advantages = program.input("advantages", 1)
+        if normalised:
+            advantages = self._normalised(advantages)
+        log_ratio = log_prob - program.input("old_log_prob", 1)
+        ratio = log_ratio.exp()
+        bound = program.scalar("clip_range")
+        within = advantages * ratio.clamp(1.0 - bound, 1.0 + bound)
+        policy_loss = -(advantages * ratio).least(within).mean()
+        program.log("policy_loss", policy_loss)
+        program.log("clip_fraction", bound.less((ratio - 1.0).abs()).mean())
+        program.log("approx_kl", (ratio - 1.0 - log_ratio).mean())
+        if clipped:
+            old = program.input("old_values", 1)
+            most = program.scalar("clip_range_vf")
+            values = old + (values - old).clamp(-most, most)
+        value_loss = (program.input("returns", 1) - values).square().mean()
+        program.log("value_loss", value_loss)
+        entropy_loss = -(entropy.mean() if entropy.batched else entropy)
+        program.log("entropy_loss", entropy_loss)
+        loss = (
+            policy_loss
+            + program.scalar("ent_coef") * entropy_loss
+            + program.scalar("vf_coef") * value_loss
+        )
+        program.log("loss", loss)
+        program.minimise(loss, self.policy.optimizer, clip=program.scalar("max_grad_norm"))
+
+    def _train_fused(self) -> None:
+        self.policy.set_training_mode(True)
+        self._update_learning_rate(self.policy.optimizer)
+        remaining = self._current_progress_remaining
+        settings = {
+            "clip_range": self.clip_range(remaining),  # type: ignore[operator]
+            "ent_coef": self.ent_coef,
+            "vf_coef": self.vf_coef,
+            "max_grad_norm": self.max_grad_norm,
+        }
+        if self.clip_range_vf is not None:
+            settings["clip_range_vf"] = self.clip_range_vf(remaining)  # type: ignore[operator]
+        total = self.rollout_buffer.buffer_size * self.rollout_buffer.n_envs
+        self._machine(min(self.batch_size, total)).prepare()  # before anything is drawn
+
+        logged = defaultdict(list)
+        going_on = True
+        for epoch in range(self.n_epochs):
+            divergences = []
+            for data in self.rollout_buffer.get(self.batch_size):
+                machine = self._machine(len(data.advantages))
+                machine.prepare()
+                self._load(machine, data)
+                machine.set(settings)
+                step = machine.steps[0] if self.target_kl is not None else None
+                self._run(machine, data, 0, step)
+                for name, title in LOGGED.items():
+                    logged[title].append(machine.number(name))
+                divergence = machine.number("approx_kl")
+                divergences.append(np.float32(divergence))
+                loss = machine.number("loss")
+                if self.target_kl is not None and divergence > 1.5 * self.target_kl:
+                    going_on = False
+                    if self.verbose >= 1:
+                        print(
+                            f"Early stopping at step {epoch} due to reaching max kl: "
+                            f"{divergence:.2f}"
+                        )
+                    break
+                if step is not None:
+                    self._run(machine, data, step, None)
+            self._n_updates += 1
+            if not going_on:
+                break
+
+        record = self.logger.record
+        for title in LOGGED.values():
+            record(title, np.mean(logged[title]))
+        record("train/approx_kl", np.mean(divergences))
+        record("train/loss", loss)
+        record("train/explained_variance", self._explained_variance())
+        self._record_std()
+        record("train/n_updates", self._n_updates, exclude="tensorboard")
+        record("train/clip_range", settings["clip_range"])
+        if self.clip_range_vf is not None:
+            record("train/clip_range_vf", settings["clip_range_vf"])

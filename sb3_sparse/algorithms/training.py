@@ -1,0 +1,190 @@
+"""What the algorithms have in common: whether their gradient steps can be fused, and how."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Iterable
+from itertools import chain
+from operator import itemgetter
+from typing import Any
+
+import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.preprocessing import preprocess_obs
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
+from torch import nn
+from torch.nn.modules.module import _has_any_global_hook
+
+from sb3_sparse.engine.native.library import why_missing
+from sb3_sparse.engine.paths import parts_of
+from sb3_sparse.engine.watch import Watch, patched
+from sb3_sparse.fused.errors import NotCovered
+from sb3_sparse.fused.machine import Machine
+from sb3_sparse.fused.program import Parts, Program
+from sb3_sparse.policies.mixin import SparsePolicyMixin
+from sb3_sparse.policies.shortcut import takes_vectors, untouched
+
+HOOKS = itemgetter("_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_pre_hooks")
+Build = Callable[[Program], None]
+
+
+class Training:
+    """The machines of a model. Copies and pickles begin without any."""
+
+    def __init__(self) -> None:
+        self._machines: dict[Hashable, Machine] = {}
+        self._watch: Watch | None = None
+        self._hooked: list[dict[str, Any]] = []
+        self._tensors: list[Any] = []
+        self.reason: str | None = None
+        """Why gradient steps are SB3's own; None: they are fused."""
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Training:
+        return Training()
+
+    def __reduce__(self) -> Any:
+        return Training, ()
+
+    def check(self, policy: BasePolicy, methods: dict[str, tuple[str, ...]]) -> SparsePolicyMixin:
+        """The policy, whose modules are all ones that programs know.
+
+        :param methods: by the dotted name of a module ("": the policy), those that SB3's
+            ``train()`` calls
+        :raises NotCovered: if somebody would notice, or miss, that SB3 does not call them
+        """
+        if not isinstance(policy, SparsePolicyMixin):
+            raise NotCovered(f"the policy, {type(policy).__name__}, is not sparse")
+        if self._watch is None or not self._watch.unchanged():
+            self._watch = None
+            self._machines.clear()
+            _check_policy(policy, methods)
+            modules = list(policy.modules())
+            self._hooked = list(map(vars, modules))
+            self._tensors = list(policy.parameters())
+            self._watch = Watch(modules)
+        if any(chain.from_iterable(map(HOOKS, self._hooked))) or _has_any_global_hook():  # type: ignore[no-untyped-call]
+            raise NotCovered("hooks on modules")
+        if any(map(_is_watched, self._tensors)):
+            raise NotCovered("hooks on parameters")
+        if not all(tensor.requires_grad for tensor in self._tensors if tensor.is_leaf) and any(
+            not parameter.requires_grad for parameter in _trained(policy)
+        ):
+            raise NotCovered("parameters that are frozen")
+        if th.is_autocast_enabled("cpu") or th.is_anomaly_enabled():
+            raise NotCovered("autocast or anomaly detection")
+        return policy
+
+    def machine(
+        self,
+        policy: SparsePolicyMixin,
+        key: Hashable,
+        batch: int,
+        optimizers: Iterable[th.optim.Optimizer],
+        build: Build,
+    ) -> Machine:
+        """What runs the next gradient step.
+
+        :param key: what a program depends on beside the policy
+        :param batch: the largest there will be
+        :param optimizers: those that will take a step
+        :param build: records the program
+        """
+        sparse = policy.sparse
+        capture = [o for o in optimizers if sparse.awaits(o) and sparse.wants_gradients(o)]
+        whole = (key, tuple(map(id, capture)))
+        machine = self._machines.get(whole)
+        if machine is None or machine.capacity < batch:
+            program = Program(capture)
+            build(program)
+            machine = self._machines[whole] = Machine(program, sparse, batch)
+        return machine
+
+
+def _check_policy(policy: SparsePolicyMixin, methods: dict[str, tuple[str, ...]]) -> None:
+    if (missing := why_missing()) is not None:
+        raise NotCovered(f"there are no kernels: {missing}")
+    if policy.device.type != "cpu":
+        raise NotCovered(f"the policy is on {policy.device}")
+    if getattr(policy, "use_sde", False):
+        raise NotCovered("gSDE")
+    for name, module in policy.named_modules():
+        if patched(module):
+            raise NotCovered(f"{name or 'the policy'} has methods of its own")
+    for name, called in methods.items():
+        if not untouched(policy.get_submodule(name), called):
+            raise NotCovered(f"{name or 'the policy'} has methods of its own")
+    for module in policy.modules():
+        if isinstance(module, BaseFeaturesExtractor) and not _only_flattens(module):
+            raise NotCovered(f"the features extractor {type(module).__name__}")
+
+
+def _only_flattens(extractor: nn.Module) -> bool:
+    flatten: Any = extractor._modules.get("flatten")
+    return (
+        type(extractor) is FlattenExtractor
+        and type(flatten) is nn.Flatten
+        and (flatten.start_dim, flatten.end_dim) == (1, -1)
+    )
+
+
+def _is_watched(tensor: Any) -> bool:
+    hooks = (tensor._backward_hooks, tensor._post_accumulate_grad_hooks)
+    return any(
+        not getattr(hook, "__module__", "").startswith("sb3_sparse.")
+        for named in hooks if named
+        for hook in named.values()
+    )  # fmt: skip
+
+
+def _trained(policy: SparsePolicyMixin) -> Iterable[th.Tensor]:
+    for optimizer in policy.sparse.optimizers:
+        for group in optimizer.param_groups:
+            yield from group["params"]
+
+
+def parts(*modules: nn.Module) -> Parts:
+    """Linear layers and activations of a network.
+
+    :raises NotCovered: if there is anything else in it
+    """
+    found = parts_of(modules)
+    if not found:
+        kinds = {type(m).__name__ for module in modules for m in module.modules()}
+        raise NotCovered(f"a network of {', '.join(sorted(kinds))}")
+    return found
+
+
+def features(policy: BasePolicy, obs: Any) -> th.Tensor:
+    """Observations as the networks get them, in numbers that programs read.
+
+    :param obs: of a buffer, shape ``(batch, *shape)``
+    """
+    if not isinstance(obs, th.Tensor):
+        raise NotCovered("dict observations")
+    if takes_vectors(policy):
+        return obs.flatten(1)
+    prepared = preprocess_obs(obs, policy.observation_space, policy.normalize_images)
+    assert isinstance(prepared, th.Tensor)
+    return prepared.flatten(1)
+
+
+class Fused(BaseAlgorithm):
+    """An algorithm whose gradient steps run in one call of the kernels where they can."""
+
+    _training: Training
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_training"]
+
+    def _trains(self) -> Training:
+        training = vars(self).get("_training")
+        if training is None:
+            training = self._training = Training()
+        return training
+
+    def _not_covered(self, why: NotCovered) -> None:
+        """Say once why gradient steps are SB3's own."""
+        training = self._trains()
+        if training.reason != str(why):
+            training.reason = str(why)
+            self.logger.debug(f"gradient steps are not fused: {why}")

@@ -1,0 +1,511 @@
+/* Runs programs of fused.h. */
+#include "fused.h"
+
+#include "activations.h"
+#include "products.h"
+
+#include "dense.h"
+
+#include <math.h>
+
+INLINE vec root_of(vec x) {
+#if WIDTH == 16
+    return (vec)_mm512_sqrt_ps((__m512)x);
+#elif WIDTH == 8
+    return (vec)_mm256_sqrt_ps((__m256)x);
+#else
+    for (int i = 0; i < WIDTH; i++) x[i] = sqrtf(x[i]);
+    return x;
+#endif
+}
+
+/* As exp_of, but infinite where float is. */
+INLINE vec whole_exp_of(vec x) {
+    vec y = exp_of(x);
+    y = choose(x > 88.7228394f, INFINITY + (vec){0}, y);
+    return choose(x < -103.97f, (vec){0}, y);
+}
+
+/* x = m 2^n with m around 1; ln m by the series of its inverse hyperbolic tangent. */
+INLINE vec log_of(vec x) {
+    ivec bits = (ivec)x;
+    ivec n = (bits - 0x3f3504f3) >> 23; /* so that m lies from the root of 1/2 to that of 2 */
+    vec m = (vec)(bits - (n << 23));
+    vec s = (m - 1) / (m + 1), z = s * s;
+    vec p = z * (2.f / 9) + 2.f / 7;
+    p = p * z + 2.f / 5;
+    p = p * z + 2.f / 3;
+    vec f = m - 1; /* ln m = f - s (f - z p), which keeps what is small */
+    vec y = f - s * (f - z * p);
+    vec e = __builtin_convertvector(n, vec);
+    y = (e * 1.42860677e-6f + y) + e * 0.693145752f;
+    y = choose(x > 3.4028e38f, x, y);
+    y = choose(x == 0, -INFINITY + (vec){0}, y);
+    y = choose(x < 0, NAN + (vec){0}, y);
+    return choose(x != x, x, y);
+}
+
+static float gelu_slope(float z, float a, float b) {
+    (void)a, (void)b;
+    return 0.5f * (1 + erff(z * 0.707106781f)) + z * 0.398942280f * expf(-0.5f * z * z);
+}
+
+/* The gradient g times the slope at the input z, of functions whose result does not tell it. */
+INLINE vec sloped_at(int64_t kind, vec g, vec z) {
+    switch (kind) {
+    case SILU: {
+        vec s = 1 / (1 + exp_of(-z));
+        return g * (s * (1 + z * (1 - s)));
+    }
+    case GELU: return g * one_by_one(z, gelu_slope, 0, 0);
+    case GELU_TANH: {
+        vec t = tanh_of(0.797884561f * (z + 0.044715f * z * z * z));
+        vec inner = 0.797884561f * (1 + 3 * 0.044715f * z * z);
+        return g * (0.5f * (1 + t) + 0.5f * z * (1 - t * t) * inner);
+    }
+    default: return g;
+    }
+}
+
+typedef struct {
+    const program_t *program;
+    int64_t thread, tile, first_tile, entries, vectors;
+} where_t;
+
+INLINE float *at(const place_t *place, const where_t *where) {
+    return place->base + where->tile * place->tile;
+}
+
+/* Loops over features and vectors of the operands that a kind has. */
+#define EACH(EXPRESSION)                                                              \
+    for (int64_t f = 0; f < o->features; f++)                                         \
+        for (int64_t j = 0; j < where->vectors; j++) {                                \
+            vec x = LOAD(a + f * o->a.feature + j * WIDTH);                           \
+            STORE(to + f * o->to.feature + j * WIDTH, EXPRESSION);                    \
+        }                                                                             \
+    break;
+#define Y LOAD(b + f * o->b.feature + j * WIDTH)
+#define Z LOAD(c + f * o->c.feature + j * WIDTH)
+#define ONE_IF(CONDITION) ((vec)((CONDITION) & (ivec)(1 + (vec){0})))
+
+INLINE vec least(vec x, vec y) { return choose((y < x) | (y != y), y, x); }
+INLINE vec huber(vec x) {
+    vec d = magnitude(x), h = at_most(d, 1);
+    return h * (d - 0.5f * h);
+}
+
+static void activate_op(const operation_t *o, const where_t *where, const float *a, float *to) {
+    float p = (float)o->p, q = (float)o->q;
+    for (int64_t f = 0; f < o->features; f++) {
+        float *row = to + f * o->to.feature;
+        memmove(row, a + f * o->a.feature, where->vectors * WIDTH * sizeof *row);
+        activate(o->number, p, q, row, where->vectors * WIDTH);
+    }
+}
+
+static void slope_op(const operation_t *o, const where_t *where, const float *a, const float *b,
+                     float *to) {
+    float p = (float)o->p, q = (float)o->q;
+    for (int64_t f = 0; f < o->features; f++) {
+        float *row = to + f * o->to.feature;
+        if (row != a + f * o->a.feature)
+            memcpy(row, a + f * o->a.feature, where->vectors * WIDTH * sizeof *row);
+        slope(o->number, p, q, b + f * o->b.feature, row, where->vectors * WIDTH);
+    }
+}
+
+static void elementwise(const operation_t *o, const where_t *where) {
+    const float *a = at(&o->a, where), *b = at(&o->b, where), *c = at(&o->c, where);
+    float *to = at(&o->to, where);
+    switch (o->kind) {
+    case COPY: EACH(x)
+    case ADD: EACH(x + Y)
+    case SUBTRACT: EACH(x - Y)
+    case MULTIPLY: EACH(x * Y)
+    case DIVIDE: EACH(x / Y)
+    case LEAST: EACH(least(x, Y))
+    case LESS: EACH(ONE_IF(x < Y))
+    case SAME: EACH(ONE_IF(x == Y))
+    case CLAMP: EACH(choose(x < Y, Y, choose(x > Z, Z, x)))
+    case INSIDE: EACH(ONE_IF((x >= Y) & (x <= Z)))
+    case EXP: EACH(whole_exp_of(x))
+    case LOG: EACH(log_of(x))
+    case SQRT: EACH(root_of(x))
+    case ABS: EACH(magnitude(x))
+    case HUBER: EACH(huber(x))
+    case ACTIVATION: activate_op(o, where, a, to); break;
+    case SLOPE_RESULT: slope_op(o, where, a, b, to); break;
+    case SLOPE_INPUT:
+        switch (o->number) {
+        case SILU: EACH(sloped_at(SILU, x, Y))
+        case GELU: EACH(sloped_at(GELU, x, Y))
+        case GELU_TANH: EACH(sloped_at(GELU_TANH, x, Y))
+        }
+        break;
+    }
+}
+
+static void fill(const operation_t *o, const where_t *where) {
+    const float *a = at(&o->a, where);
+    float *to = at(&o->to, where);
+    for (int64_t f = 0; f < o->features; f++)
+        for (int64_t e = 0; e < where->vectors * WIDTH; e++)
+            to[f * TILE + e] = e < where->entries ? a[f * o->a.feature] : 0;
+}
+
+/* Over features; `first` is how many the operand has. */
+static void over_features(const operation_t *o, const where_t *where) {
+    const float *a = at(&o->a, where), *b = at(&o->b, where);
+    float *to = at(&o->to, where);
+    int64_t numbers = where->vectors * WIDTH;
+    switch (o->kind) {
+    case SUM_FEATURES:
+    case MAX_FEATURES:
+        for (int64_t j = 0; j < numbers; j += WIDTH) {
+            vec found = LOAD(a + j);
+            for (int64_t f = 1; f < o->first; f++) {
+                vec x = LOAD(a + f * o->a.feature + j);
+                found = o->kind == SUM_FEATURES ? found + x : choose((x > found) | (x != x), x, found);
+            }
+            STORE(to + j, found);
+        }
+        break;
+    case PICK: /* the feature whose number is b */
+        for (int64_t e = 0; e < numbers; e++) {
+            int64_t f = (int64_t)b[e];
+            to[e] = f >= 0 && f < o->first ? a[f * o->a.feature + e] : NAN;
+        }
+        break;
+    case PUT: /* a at the feature whose number is b, else 0 */
+        for (int64_t f = 0; f < o->features; f++)
+            for (int64_t e = 0; e < numbers; e++)
+                to[f * o->to.feature + e] = (int64_t)b[e] == f ? a[e] : 0;
+        break;
+    }
+}
+
+#define ROWS(TYPE)                                                                          \
+    for (int64_t e = 0; e < entries; e++) {                                                 \
+        int64_t n = from + e;                                                               \
+        const TYPE *row = (const TYPE *)input->rows + (input->index ? input->index[n] : n) * input->stride; \
+        for (int64_t f = 0; f < o->features; f++) to[f * TILE + e] = (float)row[f];         \
+    }                                                                                       \
+    break;
+
+/* What fills up the last vector repeats the last entry, so that it is as finite as the rest. */
+static void load_rows(const operation_t *o, const where_t *where) {
+    const input_t *input = where->program->inputs + o->number;
+    int64_t from = where->tile * TILE, entries = where->entries;
+    float *to = at(&o->to, where);
+    switch (input->type) {
+    case FLOAT32:
+        if (!input->index && input->stride == o->features) {
+            to_tile((const float *)input->rows + from * o->features, entries, o->features, TILE, to);
+            break;
+        }
+        ROWS(float)
+    case FLOAT64: ROWS(double)
+    case INT64: ROWS(int64_t)
+    case INT32: ROWS(int32_t)
+    case UINT8: ROWS(uint8_t)
+    case INT8: ROWS(int8_t)
+    }
+    for (int64_t f = 0; f < o->features; f++)
+        for (int64_t e = entries; e < where->vectors * WIDTH; e++)
+            to[f * TILE + e] = to[f * TILE + entries - 1];
+}
+
+static void linear(const operation_t *o, const where_t *where) {
+    const linear_t *layer = where->program->layers + o->number;
+    const float *x = at(&o->a, where);
+    float *y = at(&o->to, where);
+    int relu = o->first == RELU;
+    if (layer->row_start)
+        gather(where->vectors, layer->rows, layer->row_start, layer->column, layer->value,
+               layer->bias, 0, relu, x, y);
+    else
+        dense_forward(where->vectors, layer->rows, layer->columns, layer->value, layer->bias, relu, x, y);
+    if (o->first > RELU)
+        for (int64_t f = 0; f < layer->rows; f++)
+            activate(o->first, (float)o->p, (float)o->q, y + f * TILE, where->vectors * WIDTH);
+}
+
+/* The gradient of a layer's inputs first..last; 0 where b is not positive, if there is one. */
+static void linear_back(const operation_t *o, const where_t *where) {
+    const linear_t *layer = where->program->layers + o->number;
+    const float *g = at(&o->a, where), *gate = o->b.base ? at(&o->b, where) : 0;
+    float *to = at(&o->to, where);
+    if (layer->row_start)
+        gather(where->vectors, o->last - o->first, layer->column_start + o->first, layer->row,
+               layer->turned, 0, gate, 0, g, to);
+    else
+        dense_back(where->vectors, layer->rows, layer->columns, o->first, o->last, layer->value, g,
+                   gate, to);
+}
+
+/* Gradients of weight and bias from a, that of the layer's result, and b, its input. */
+static void linear_grad(const operation_t *o, const where_t *where) {
+    const linear_t *layer = where->program->layers + o->number;
+    const float *g = at(&o->a, where), *x = at(&o->b, where);
+    int64_t own = where->thread * where->program->per_thread;
+    int add = where->tile > where->first_tile;
+    if (o->kind == LINEAR_DENSE_GRAD) {
+        dense_dots(where->vectors, layer->rows, layer->columns, g, x, layer->dense_grad, where->tile > 0);
+        return;
+    }
+    if (layer->row_start)
+        dots(where->vectors, layer->rows, layer->row_start, layer->column, g, x,
+             layer->weight_grad + own, add);
+    else
+        dense_dots(where->vectors, layer->rows, layer->columns, g, x, layer->weight_grad + own, add);
+    if (layer->bias) sums(where->vectors, layer->rows, g, layer->bias_grad + own, add);
+}
+
+static void run_tiled(const operation_t *o, const where_t *where) {
+    switch (o->kind) {
+    case FILL: fill(o, where); break;
+    case SUM_FEATURES: case MAX_FEATURES: case PICK: case PUT: over_features(o, where); break;
+    case LOAD_ROWS: load_rows(o, where); break;
+    case LINEAR: linear(o, where); break;
+    case LINEAR_BACK: linear_back(o, where); break;
+    case LINEAR_GRAD: case LINEAR_DENSE_GRAD: linear_grad(o, where); break;
+    default: elementwise(o, where);
+    }
+}
+
+/* One phase and how its tiles are shared. */
+typedef struct {
+    const program_t *program;
+    const operation_t *first, *last;
+    int64_t tiles, shares;
+} phase_t;
+
+static void run_share(const phase_t *phase, int64_t share) {
+    where_t where = {.program = phase->program, .thread = share};
+    where.first_tile = phase->tiles * share / phase->shares;
+    int64_t end = phase->tiles * (share + 1) / phase->shares;
+    for (where.tile = where.first_tile; where.tile < end; where.tile++) {
+        int64_t left = phase->program->batch - where.tile * TILE;
+        where.entries = left < TILE ? left : TILE;
+        where.vectors = (where.entries + WIDTH - 1) / WIDTH;
+        for (const operation_t *o = phase->first; o < phase->last; o++) run_tiled(o, &where);
+    }
+}
+
+static void take_shares(void *argument) {
+    const phase_t *phase = argument;
+    for (int64_t i = sb3_sparse_openmp.thread(); i < phase->shares; i += sb3_sparse_openmp.threads())
+        run_share(phase, i);
+}
+
+static void add_to(float *to, const float *from, int64_t count) {
+    for (int64_t i = 0; i < count; i++) to[i] += from[i];
+}
+
+static void run_phase(const program_t *program, const operation_t *first, const operation_t *last) {
+    int64_t tiles = (program->batch + TILE - 1) / TILE;
+    phase_t phase = {program, first, last, tiles, 1};
+    int captures = 0; /* what several threads would add up in one place */
+    for (const operation_t *o = first; o < last; o++) captures |= o->kind == LINEAR_DENSE_GRAD;
+    if (sb3_sparse_openmp.parallel && !captures)
+        phase.shares = program->threads < tiles ? program->threads : tiles;
+    if (phase.shares <= 1) {
+        phase.shares = 1;
+        run_share(&phase, 0);
+        return;
+    }
+    sb3_sparse_openmp.parallel(take_shares, &phase, (unsigned)phase.shares, 0);
+    for (const operation_t *o = first; o < last; o++) {
+        if (o->kind != LINEAR_GRAD) continue;
+        const linear_t *layer = program->layers + o->number;
+        int64_t count = layer->row_start ? layer->row_start[layer->rows] : layer->rows * layer->columns;
+        for (int64_t i = 1; i < phase.shares; i++) {
+            int64_t own = i * program->per_thread;
+            add_to(layer->weight_grad, layer->weight_grad + own, count);
+            if (layer->bias) add_to(layer->bias_grad, layer->bias_grad + own, layer->rows);
+        }
+    }
+}
+
+static void set_lanes(float *to, float x) {
+    for (int i = 0; i < TILE; i++) to[i] = x;
+}
+
+/* Each feature's sum over the batch. */
+static void sum_batch(const program_t *program, const operation_t *o) {
+    for (int64_t f = 0; f < o->features; f++) {
+        double sum = 0;
+        for (int64_t n = 0; n < program->batch; n += TILE) {
+            const float *a = o->a.base + n / TILE * o->a.tile + f * o->a.feature;
+            int64_t entries = program->batch - n < TILE ? program->batch - n : TILE;
+            for (int64_t e = 0; e < entries; e++) sum += a[e];
+        }
+        set_lanes(o->to.base + f * TILE, (float)sum);
+    }
+}
+
+static int has_nan(const program_t *program, const operation_t *o) {
+    for (int64_t n = 0; n < program->batch; n++)
+        for (int64_t f = 0; f < o->features; f++) {
+            float x = o->a.base[n / TILE * o->a.tile + f * o->a.feature + n % TILE];
+            if (x != x) return 1;
+        }
+    return 0;
+}
+
+/* Scales gradients of parameters first..last so that their norm is at most that of `a`. */
+static void clip_norm(const program_t *program, const operation_t *o) {
+    double sum = 0;
+    for (int64_t i = o->first; i < o->last; i++) {
+        const parameter_t *p = program->parameters + i;
+        float part = 0;
+        for (int64_t k = 0; k < p->count; k++) part += p->grad[k] * p->grad[k];
+        sum += part;
+    }
+    float norm = (float)sqrt(sum), factor = *o->a.base / (norm + 1e-6f);
+    set_lanes(o->to.base, norm);
+    if (factor >= 1) return;
+    for (int64_t i = o->first; i < o->last; i++) {
+        const parameter_t *p = program->parameters + i;
+        for (int64_t k = 0; k < p->count; k++) p->grad[k] *= factor;
+    }
+}
+
+/* What does not count has no gradient. */
+static void mask_grads(const program_t *program, const operation_t *o) {
+    for (int64_t i = o->first; i < o->last; i++) {
+        const parameter_t *p = program->parameters + i;
+        for (int64_t k = 0; p->mask && k < p->count; k++) p->grad[k] = p->mask[k] != 0 ? p->grad[k] : 0;
+    }
+}
+
+typedef struct {
+    vec first, kept, second, forgotten, squared, rate, root, epsilon, decay, shrink;
+} adam_t;
+
+INLINE void adam(const adam_t *s, vec *p, vec *m, vec *v, vec g) {
+    *p *= s->shrink;
+    g += s->decay * *p;
+    *m += s->first * (g - *m);
+    *v = s->second * *v + s->squared * (g * g);
+    *p -= s->rate * *m / (root_of(*v) / s->root + s->epsilon);
+}
+
+INLINE void rmsprop(const adam_t *s, vec *p, vec *v, vec g) {
+    g += s->decay * *p;
+    *v = s->second * *v + s->squared * (g * g);
+    *p -= s->rate * g / root_of(*v + s->epsilon);
+}
+
+static void step_parameter(const parameter_t *p, const group_t *group) {
+    double t = *p->steps += 1, rate = group->rate;
+    double decay = p->decay + (group->decoupled ? 0 : group->decay), root = 1;
+    if (group->optimizer == ADAM) {
+        rate /= 1 - pow(group->beta1, t);
+        root = sqrt(1 - pow(group->beta2, t));
+    }
+#define FLOATS(x) ((float)(x) + (vec){0})
+    adam_t s = {
+        .first = FLOATS(1 - group->beta1), .second = FLOATS(group->beta2),
+        .squared = FLOATS(1 - group->beta2), .rate = FLOATS(rate), .root = FLOATS(root),
+        .epsilon = FLOATS(group->epsilon), .decay = FLOATS(decay),
+        .shrink = FLOATS(group->decoupled ? 1 - group->rate * group->decay : 1),
+    };
+    for (int64_t k = 0; k < p->count; k += WIDTH) {
+        int64_t lanes = p->count - k < WIDTH ? p->count - k : WIDTH;
+        vec x = {0}, m = {0}, v = {0}, g = {0};
+        int whole = lanes == WIDTH && !p->flat;
+        if (whole) {
+            x = LOAD(p->number + k), v = LOAD(p->second + k), g = LOAD(p->grad + k);
+            if (p->first) m = LOAD(p->first + k);
+        } else
+            for (int64_t i = 0; i < lanes; i++) {
+                int64_t n = p->flat ? p->flat[k + i] : k + i;
+                x[i] = p->number[n], v[i] = p->second[n], g[i] = p->grad[k + i];
+                if (p->first) m[i] = p->first[n];
+            }
+        if (group->optimizer == ADAM)
+            adam(&s, &x, &m, &v, g);
+        else
+            rmsprop(&s, &x, &v, g);
+        if (whole) {
+            STORE(p->number + k, x), STORE(p->second + k, v);
+            if (p->first) STORE(p->first + k, m);
+        } else
+            for (int64_t i = 0; i < lanes; i++) {
+                int64_t n = p->flat ? p->flat[k + i] : k + i;
+                p->number[n] = x[i], p->second[n] = v[i];
+                if (p->first) p->first[n] = m[i];
+                if (p->packed) p->packed[k + i] = x[i];
+            }
+    }
+}
+
+/* target += factor * (number - target), of parameters `first` and `last`. */
+static void polyak(const program_t *program, const operation_t *o) {
+    const parameter_t *online = program->parameters + o->first, *target = program->parameters + o->last;
+    float tau = (float)o->p;
+    for (int64_t k = 0; k < online->count; k++) {
+        int64_t n = online->flat ? online->flat[k] : k;
+        float x = target->number[n] + tau * (online->number[n] - target->number[n]);
+        target->number[n] = x;
+        if (target->packed) target->packed[k] = x;
+    }
+}
+
+static void pack(const parameter_t *p) {
+    for (int64_t k = 0; k < p->count; k++) p->packed[k] = p->number[p->flat[k]];
+}
+
+static void turn(const linear_t *layer) {
+    int64_t count = layer->row_start[layer->rows];
+    for (int64_t k = 0; k < count; k++) layer->turned[k] = layer->value[layer->position[k]];
+}
+
+/* Whether it found what must not be. */
+static int run_once(const program_t *program, const operation_t *o) {
+    where_t where = {.program = program, .entries = TILE, .vectors = TILE / WIDTH};
+    const parameter_t *p = program->parameters + o->number;
+    switch (o->kind) {
+    case SUM_BATCH: sum_batch(program, o); break;
+    case CHECK: return has_nan(program, o);
+    case SPREAD:
+        for (int64_t f = 0; f < o->features; f++) set_lanes(o->to.base + f * TILE, p->number[f]);
+        break;
+    case EXPORT:
+        for (int64_t f = 0; f < o->features; f++) p->grad[f] = o->a.base[f * o->a.feature];
+        break;
+    case PACK:
+        if (p->packed) pack(p);
+        break;
+    case TURN:
+        if (program->layers[o->number].row_start) turn(program->layers + o->number);
+        break;
+    case MASK_GRADS: mask_grads(program, o); break;
+    case CLIP_NORM: clip_norm(program, o); break;
+    case OPTIMIZE:
+        for (int64_t i = o->first; i < o->last; i++)
+            step_parameter(program->parameters + i, program->groups + program->parameters[i].group);
+        break;
+    case POLYAK: polyak(program, o); break;
+    default: run_tiled(o, &where);
+    }
+    return 0;
+}
+
+/* Operations first..last; the number of the check that failed, or -1. */
+int64_t NAMED(fused, SUFFIX)(const program_t *program, int64_t first, int64_t last) {
+    const operation_t *all = program->operations;
+    while (first < last) {
+        if (!all[first].tiled) {
+            if (run_once(program, all + first)) return first;
+            first++;
+            continue;
+        }
+        int64_t end = first;
+        while (end < last && all[end].tiled) end++;
+        run_phase(program, all + first, all + end);
+        first = end;
+    }
+    return -1;
+}

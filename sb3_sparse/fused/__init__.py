@@ -1,0 +1,1 @@
+"""Gradient steps as programs that the kernels run in one call."""

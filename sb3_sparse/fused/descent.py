@@ -1,0 +1,139 @@
+"""A step down the gradient of a loss: reverse mode, recorded once."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import torch as th
+
+from sb3_sparse.fused.errors import NotCovered
+from sb3_sparse.fused.values import Value
+
+if TYPE_CHECKING:
+    from sb3_sparse.fused.program import Behind, Program
+
+
+class Descent:
+    """Records gradients, and the step of an optimizer that they are for.
+
+    :param program: records
+    :param optimizer: moves those of its parameters that the loss depends on
+    """
+
+    def __init__(self, program: Program, optimizer: th.optim.Optimizer) -> None:
+        self._program = program
+        self._optimizer = optimizer
+        self._captured = id(optimizer) in program.capture
+        self._wanted = {id(p): p for group in optimizer.param_groups for p in group["params"]}
+        self._grads: dict[Value, Value] = {}
+        self._layers: list[int] = []
+
+    def record(self, loss: Value, clip: Value | None) -> None:
+        """All of it.
+
+        :param loss: one number
+        :param clip: greatest norm of the gradient
+        """
+        program = self._program
+        before = program.values[:]
+        program.needs = self._depending(before)
+        self._grads = {loss: program.constant(1.0)}
+        begin = len(program.slots)
+        for value in reversed(before):
+            if value in self._grads and value in program.needs:
+                self._pass_on(value, self._grads[value])
+        self._export()
+        self._finish((begin, len(program.slots)), clip)
+
+    def _depending(self, values: list[Value]) -> set[Value]:
+        """What the optimizer's parameters have a part in."""
+        program = self._program
+        found = {value for key, value in program.vectors.items() if key in self._wanted}
+        for value in values:
+            behind = program.behind.get(value)
+            if (behind is not None and self._moves(behind.layer)) or any(
+                parent in found for parent, _ in value.parents
+            ):
+                found.add(value)
+        return found
+
+    def _moves(self, layer: int) -> bool:
+        return id(self._program.layers[layer].weight) in self._wanted
+
+    def _pass_on(self, value: Value, g: Value) -> None:
+        behind = self._program.behind.get(value)
+        if behind is not None:
+            g = self._sloped(g, value, behind)
+            if self._moves(behind.layer):
+                self._record_grads(behind, g)
+        for parent, back in value.parents:
+            if parent in self._program.needs:
+                self._add(parent, back(g))
+
+    def _sloped(self, g: Value, y: Value, behind: Behind) -> Value:
+        kind, p, q = behind.activation
+        if not kind or g.gated:
+            return g
+        made = Value(self._program, y.features, True)
+        self._program.record("SLOPE_RESULT", made, g, y, number=kind, p=p, q=q)
+        return made
+
+    def _record_grads(self, behind: Behind, g: Value) -> None:
+        program, layer = self._program, behind.layer
+        module = program.layers[layer]
+        if any(s.tensor is module.weight and s.optimizer is self._optimizer for s in program.slots):
+            raise NotCovered("a loss that uses a layer twice")
+        program.slot(module.weight, layer, self._optimizer)
+        if module.bias is not None:
+            program.slot(module.bias, None, self._optimizer)
+        for kind in ["LINEAR_GRAD"] + ["LINEAR_DENSE_GRAD"] * self._captured:
+            program.record(kind, None, g, behind.x, number=layer, tiled=True, writes=self._all)
+        self._layers.append(layer)
+
+    @property
+    def _all(self) -> tuple[Any, ...]:
+        return (("gradients", id(self._optimizer)),)
+
+    def _add(self, parent: Value, g: Value) -> None:
+        """Add to a gradient, summed over what ``parent`` was broadcast to."""
+        if g.features > parent.features:
+            g = g.sum_features()
+        elif g.features == 1 < parent.features:
+            spread = Value(self._program, parent.features, g.batched)
+            self._program.record("COPY", spread, g)
+            g = spread
+        if g.batched and not parent.batched:
+            g = g.sum()
+        one = self._grads.get(parent)
+        if one is not None:
+            total = one + g
+            total.gated, total.origin = g.gated and one.gated, g.origin
+            g = total
+        self._grads[parent] = g
+
+    def _export(self) -> None:
+        """Gradients of vectors of parameters to where the optimizer looks for them."""
+        program = self._program
+        for key, value in program.vectors.items():
+            if key in self._wanted and value in self._grads:
+                number = program.slot(self._wanted[key], None, self._optimizer)
+                program.record(
+                    "EXPORT", None, self._grads[value], features=value.features, number=number,
+                    tiled=False, writes=self._all,
+                )  # fmt: skip
+
+    def _finish(self, slots: tuple[int, int], clip: Value | None) -> None:
+        program = self._program
+        common: dict[str, Any] = {
+            "first": slots[0], "last": slots[1], "tiled": False,
+            "reads": self._all, "writes": self._all,
+        }  # fmt: skip
+        program.record("MASK_GRADS", None, **common)
+        if clip is not None:
+            program.record("CLIP_NORM", Value(program, 1, False), clip, **common)
+        step = program.record("OPTIMIZE", None, **common, changes=True)
+        program.finish_step(self._optimizer, slots, step, self._captured)
+        # A loss to come reads them anew.
+        program.turned.difference_update(self._layers)
+        for key in self._wanted:
+            program.vectors.pop(key, None)

@@ -1,0 +1,177 @@
+"""Runs a program on a policy's tensors."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Mapping
+from typing import Any
+
+import torch as th
+
+from sb3_sparse.engine.controller import Controller
+from sb3_sparse.engine.native.library import bits_of, library
+from sb3_sparse.fused.errors import CheckFailed, NotCovered
+from sb3_sparse.fused.memory import TILE, lay_out
+from sb3_sparse.fused.operations import KINDS, in_phases
+from sb3_sparse.fused.program import Minimised, Program
+from sb3_sparse.fused.tables import Tables
+from sb3_sparse.fused.values import Value
+
+TYPES = {
+    th.float32: 0, th.float64: 1, th.int64: 2, th.int32: 3, th.uint8: 4, th.bool: 4, th.int8: 5
+}  # fmt: skip
+
+
+class Machine:
+    """A program, and room for its values.
+
+    :param program: what to run
+    :param controller: of the policy whose tensors it moves
+    :param batch: the largest there will be
+    """
+
+    def __init__(self, program: Program, controller: Controller, batch: int) -> None:
+        self.program = program
+        self.controller = controller
+        self.capacity = batch
+        self.operations = in_phases(program.operations)
+        self.steps = [self._index_of(m.step) for m in program.minimised]
+        self.marks = {name: self._index_of(step) + 1 for name, step in program.marks.items()}
+        self.tables = Tables(program, controller)
+        self._work, self._places = lay_out(program.values, batch)
+        self._at = self._work.data_ptr()
+        self._view = self._work.numpy()
+        self._lanes = {
+            name: self._view[slice(self._places[value], self._places[value] + TILE)]
+            for name, value in program.scalars.items()
+        }
+        for number, value in program.constants.items():
+            self._view[self._places[value] : self._places[value] + TILE] = number
+        self._logged = {name: self._place(value) for name, value in program.logged.items()}
+        fields = [field for operation in self.operations for field in self._fields(operation)]
+        self._operations = (ctypes.c_int64 * len(fields))(*fields)
+        self._inputs = (ctypes.c_int64 * max(1, 4 * len(program.rows)))()
+        self._rows = {name: number for number, (name, _) in enumerate(program.rows)}
+        self._features = dict(program.rows)
+        self._held: dict[str, th.Tensor] = {}
+        self._argument = (ctypes.c_int64 * 8)()
+        self._call = library().sb3_sparse_fused
+        self._batch = 0
+
+    def _index_of(self, operation: Any) -> int:
+        return next(i for i, one in enumerate(self.operations) if one is operation)
+
+    def _place(self, value: Value) -> int:
+        return self._places[value.root] + TILE * value.offset
+
+    def _operand(self, value: Value | None) -> tuple[int, int, int]:
+        if value is None:
+            return 0, 0, 0
+        tile = value.root.features * TILE if value.batched else 0
+        feature = 0 if value.features == 1 else TILE
+        return self._at + 4 * self._place(value), tile, feature
+
+    def _fields(self, operation: Any) -> list[int]:
+        """``operation_t`` of ``fused.h``."""
+        operands = [*operation.operands, None, None, None][:3]
+        return [
+            KINDS[operation.kind],
+            int(operation.tiled),
+            *self._operand(operation.to),
+            *(field for operand in operands for field in self._operand(operand)),
+            operation.features,
+            operation.first,
+            operation.last,
+            operation.number,
+            bits_of(operation.p),
+            bits_of(operation.q),
+        ]
+
+    def prepare(self) -> None:
+        """Look where the tensors are now, and what optimizers are set to.
+
+        :raises NotCovered: if one is where the kernels cannot read it
+        """
+        self.tables.refresh()
+        argument: Any = self._argument
+        argument[0] = ctypes.addressof(self._operations)
+        argument[1:4] = self.tables.addresses
+        argument[4] = ctypes.addressof(self._inputs)
+        argument[6] = th.get_num_threads()
+        argument[7] = self.tables.per_thread
+
+    def set(self, scalars: Mapping[str, float]) -> None:
+        """Hand over numbers by name."""
+        for name, number in scalars.items():
+            if name in self._lanes:
+                self._lanes[name][:] = number
+
+    def load(self, rows: Mapping[str, th.Tensor]) -> None:
+        """Hand over a batch.
+
+        :param rows: by name, shapes ``(batch, features)`` or ``(batch,)`` for one feature
+        :raises NotCovered: for numbers of another type or shape
+        """
+        batch = 0
+        for name, tensor in rows.items():
+            number = self._rows.get(name)
+            if number is None:
+                continue
+            kind = TYPES.get(tensor.dtype)
+            features = tensor.numel() // max(1, len(tensor))
+            if kind is None or features != self._features[name]:
+                raise NotCovered(f"{name} of {tensor.dtype} and shape {tuple(tensor.shape)}")
+            if not tensor.is_contiguous():
+                tensor = tensor.contiguous()
+            self._held[name] = tensor
+            batch = len(tensor)
+            self._inputs[4 * number : 4 * number + 4] = [tensor.data_ptr(), kind, features, 0]
+        if batch != self._batch:
+            self._batch = batch
+            self._argument[5] = batch
+            if "1 / batch" in self._lanes:
+                self._lanes["1 / batch"][:] = 1 / batch
+
+    def number(self, name: str) -> float:
+        """What the last run logged under ``name``."""
+        return float(self._view[self._logged[name]])
+
+    def run(self, first: int = 0, last: int | None = None) -> None:
+        """Run the program, or a range of its operations.
+
+        Torch takes the steps of optimizers that the kernels do not know, and those at which masks
+        move.
+
+        :raises CheckFailed: at a check, before anything that comes after it
+        """
+        last = len(self.operations) if last is None else last
+        for minimised, step in zip(self.program.minimised, self.steps, strict=True):
+            if not first <= step < last:
+                continue
+            if self.tables.steps(minimised) and not self.controller.awaits(minimised.optimizer):
+                self.controller.passed(minimised.optimizer)
+                self.tables.passed(minimised)
+                continue
+            self._go(first, step)
+            self._step_by_torch(minimised)
+            first = step + 1
+        self._go(first, last)
+
+    def _go(self, first: int, last: int) -> None:
+        failed = self._call(self._argument, first, last)
+        if failed >= 0:
+            raise CheckFailed(self.program.checks[id(self.operations[failed])])
+
+    def _step_by_torch(self, minimised: Minimised) -> None:
+        optimizer = minimised.optimizer
+        self.tables.hand_over(minimised)
+        optimizer.step()
+        optimizer.zero_grad(set_to_none=True)
+        self.prepare()
+        self._repack()
+
+    def _repack(self) -> None:
+        """Read anew what layers compute with; their weights were written elsewhere."""
+        for i, operation in enumerate(self.operations):
+            if operation.kind == "PACK":
+                self._go(i, i + 1)

@@ -1,0 +1,119 @@
+"""How a program reads a layer's weight: by its connections, or as a matrix."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch as th
+from torch import nn
+
+from sb3_sparse.engine.controller import Controller
+from sb3_sparse.engine.layers import SparseLayer
+from sb3_sparse.engine.linear import CompactLinear
+from sb3_sparse.engine.masked import MaskedLayer
+from sb3_sparse.engine.structure import Structure
+from sb3_sparse.fused.errors import NotCovered
+
+SPARSE_ENOUGH = 0.5
+"""Density up to which a masked layer is computed by its connections."""
+
+
+class Stored(NamedTuple):
+    """A weight as it is now.
+
+    :param numbers: what the kernels read and optimizers move
+    :param structure: connections; None: the weight is read as a matrix
+    :param flat: where each connection stands in ``numbers``, int32; None: one after the other
+    :param mask: of a matrix, 0 where inactive; None: all count
+    :param layer: the sparse layer whose weight it is; None: it is a target's, or not sparse
+    """
+
+    numbers: th.Tensor
+    structure: Structure | None = None
+    flat: th.Tensor | None = None
+    mask: th.Tensor | None = None
+    layer: SparseLayer | None = None
+
+    @property
+    def size(self) -> int:
+        """How many numbers an optimizer moves."""
+        return self.numbers.numel() if self.structure is None else self.structure.nnz
+
+
+class Storage:
+    """The weights of a policy's linear layers.
+
+    :param controller: knows the sparse ones
+    """
+
+    def __init__(self, controller: Controller) -> None:
+        layers = list(controller.layers)
+        self._layers = {id(layer.module): layer for layer in layers}
+        self._targets = {id(target): layer for layer in layers for target in layer.targets}
+        self._structures: dict[int, tuple[object, Structure, th.Tensor]] = {}
+
+    def state(self, module: nn.Linear) -> tuple[object, ...]:
+        """Equal as long as what :meth:`of` gives holds."""
+        if isinstance(module, CompactLinear):
+            return module.structure, module.snapshot, module.weight.data_ptr()
+        layer = self._layers.get(id(module))
+        if layer is not None:
+            return layer, layer.connections, module.weight.data_ptr()
+        layer = self._targets.get(id(module))
+        if layer is not None and not layer.always_full:
+            return layer.connections, module.weight._version, module.weight.data_ptr()
+        return (module.weight.data_ptr(),)
+
+    def of(self, module: nn.Linear, follows: bool) -> Stored:
+        """How the weight of a layer is stored now.
+
+        :param follows: whether it is a target that follows its layer at each step
+        :raises NotCovered: if it is nothing that the kernels read
+        """
+        if isinstance(module, CompactLinear):
+            structure, values = module.live()
+            if follows and structure is not module.structure:
+                raise NotCovered("a target with other connections than its layer")
+            check_readable(values)
+            return Stored(values, structure, layer=self._layers.get(id(module)))
+        weight = module.weight
+        check_readable(weight)
+        layer = self._layers.get(id(module)) or self._targets.get(id(module))
+        if not isinstance(layer, MaskedLayer) or layer.full:
+            return Stored(weight, layer=self._layers.get(id(module)))
+        sparse = layer.nnz <= SPARSE_ENOUGH * layer.size
+        if id(module) in self._layers:
+            if not sparse:
+                return Stored(weight, mask=layer.float_mask, layer=layer)
+            structure, flat = self._structure(id(layer), layer.connections, layer.mask(), layer)
+            return Stored(weight, structure, flat, layer=layer)
+        if not sparse:
+            return Stored(weight)
+        written = (weight.detach() != 0).numpy().ravel()
+        structure, flat = self._structure(id(layer), layer.connections, layer.mask(), layer)
+        if not (written & ~layer.mask()).any():
+            return Stored(weight, structure, flat)
+        if follows:
+            raise NotCovered("a target with other connections than its layer")
+        structure, flat = self._structure(id(module), object(), written, layer)
+        return Stored(weight, structure, flat)
+
+    def _structure(
+        self, key: int, connections: object, mask: np.ndarray, layer: SparseLayer
+    ) -> tuple[Structure, th.Tensor]:
+        kept = self._structures.get(key)
+        if kept is None or kept[0] is not connections:
+            structure = Structure.of_mask(mask, (layer.shape[0], layer.shape[1]))
+            flat = th.from_numpy(structure.flat.astype(np.int32))
+            kept = self._structures[key] = connections, structure, flat
+        return kept[1:]
+
+
+def check_readable(tensor: th.Tensor) -> None:
+    """Refuse what the kernels cannot read in place.
+
+    :raises NotCovered: for anything but contiguous float32 on the CPU
+    """
+    if tensor.dtype != th.float32 or not tensor.is_cpu or not tensor.is_contiguous():
+        raise NotCovered(f"a parameter of {tensor.dtype} on {tensor.device}")

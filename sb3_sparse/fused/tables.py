@@ -1,0 +1,245 @@
+"""Where a program's layers, parameters and optimizers are in memory."""
+
+from __future__ import annotations
+
+import ctypes
+from typing import Any
+
+import torch as th
+
+from sb3_sparse.engine.controller import Controller
+from sb3_sparse.engine.native.library import bits_of
+from sb3_sparse.fused.optimizers import moments_of, settings_of
+from sb3_sparse.fused.program import Minimised, Program, Slot
+from sb3_sparse.fused.storage import Storage, Stored, check_readable
+
+ALIGNED = 16
+"""Numbers in a cache line."""
+
+
+def _empty(count: int) -> th.Tensor:
+    return th.zeros(count, dtype=th.float32, device="cpu")
+
+
+def _padded(count: int) -> int:
+    return -(-count // ALIGNED) * ALIGNED
+
+
+class Tables:
+    """``linear_t``, ``parameter_t`` and ``group_t`` of ``fused.h``, kept up to date.
+
+    :param program: whose
+    :param controller: of the policy
+    """
+
+    def __init__(self, program: Program, controller: Controller) -> None:
+        self._program = program
+        self._controller = controller
+        self._storage = Storage(controller)
+        followed = {
+            program.slots[operation.last].layer
+            for operation in program.operations
+            if operation.kind == "POLYAK"
+        }
+        self._follows = [number in followed for number in range(len(program.layers))]
+        self._optimizers = {id(m.optimizer): m.optimizer for m in program.minimised}
+        self._groups: dict[int, int] = {}
+        self._state: Any = None
+        self._stored: list[Stored] = []
+        self._held: list[Any] = []
+        self._grads = _empty(0)
+        self._places: dict[int, tuple[int, int]] = {}
+        self._dense_grads: dict[int, th.Tensor] = {}
+        self._steps: dict[int, bool] = {}
+        self._arrays: list[Any] = [(ctypes.c_int64 * 1)()] * 3
+        self.per_thread = 0
+        decayed = controller.weight_decay and {
+            id(kernel) for network in controller.networks for kernel in network.kernels
+        }
+        self._decayed = decayed or set()
+
+    @property
+    def addresses(self) -> list[int]:
+        """Of the three tables."""
+        return [ctypes.addressof(array) for array in self._arrays]
+
+    def steps(self, minimised: Minimised) -> bool:
+        """Whether the kernels take the optimizer's steps."""
+        return self._steps[id(minimised.optimizer)]
+
+    def refresh(self) -> None:
+        """Look where everything is now.
+
+        :raises NotCovered: if something is where the kernels cannot read it
+        """
+        self._fill_groups()
+        state = self._current_state()
+        if state != self._state:
+            self._fill()
+            self._state = state
+
+    def _fill_groups(self) -> None:
+        fields: list[int] = []
+        self._groups = {}
+        for key, optimizer in self._optimizers.items():
+            groups = settings_of(optimizer, self._controller)
+            moved = (
+                s for m in self._program.minimised if m.optimizer is optimizer
+                for s in self._program.slots[slice(*m.slots)]
+            )  # fmt: skip
+            self._steps[key] = groups is not None and all(
+                moments_of(optimizer, slot.tensor) is not None for slot in moved
+            )
+            for group, settings in zip(optimizer.param_groups, groups or [], strict=False):
+                for parameter in group["params"]:
+                    self._groups[id(parameter)] = len(fields) // 7
+                fields += settings
+        self._arrays[2] = (ctypes.c_int64 * max(1, len(fields)))(*fields)
+
+    def _current_state(self) -> list[Any]:
+        program = self._program
+        tensors = [slot.tensor.data_ptr() for slot in program.slots]
+        layers = [self._storage.state(module) for module in program.layers]
+        moments: list[Any] = []
+        for slot in program.slots:
+            if slot.optimizer is not None and self._steps[id(slot.optimizer)]:
+                found = moments_of(slot.optimizer, slot.tensor)
+                moments += [t if t is None else t.data_ptr() for t in found or ()]
+        return [tensors, layers, moments, th.get_num_threads(), list(self._groups.values()),
+                list(self._steps.values())]  # fmt: skip
+
+    def _fill(self) -> None:
+        program = self._program
+        self._held = []
+        self._stored = [
+            self._storage.of(module, follows)
+            for module, follows in zip(program.layers, self._follows, strict=True)
+        ]
+        self._place_grads()
+        packed = {
+            number: _empty(stored.size)
+            for number, stored in enumerate(self._stored)
+            if stored.flat is not None
+        }
+        fields: list[int] = []
+        for number, stored in enumerate(self._stored):
+            fields += self._linear(number, stored, packed.get(number))
+        self._arrays[0] = (ctypes.c_int64 * max(1, len(fields)))(*fields)
+        fields = []
+        for slot in program.slots:
+            fields += self._parameter(slot, packed)
+        self._arrays[1] = (ctypes.c_int64 * max(1, len(fields)))(*fields)
+
+    def _place_grads(self) -> None:
+        """Room for the gradient of each parameter, once for each thread."""
+        self._places = {}
+        at = 0
+        for slot in self._program.slots:
+            if slot.optimizer is not None and id(slot.tensor) not in self._places:
+                count = self._count(slot)
+                self._places[id(slot.tensor)] = at, count
+                at += _padded(count)
+        self.per_thread = at
+        self._grads = _empty(at * max(1, th.get_num_threads()))
+
+    def _count(self, slot: Slot) -> int:
+        return slot.tensor.numel() if slot.layer is None else self._stored[slot.layer].size
+
+    def _grad_at(self, tensor: th.Tensor | None) -> int:
+        place = None if tensor is None else self._places.get(id(tensor))
+        return 0 if place is None else self._grads.data_ptr() + 4 * place[0]
+
+    def _address(self, tensor: th.Tensor | None) -> int:
+        """Where it lies; held, so that nobody frees it."""
+        if tensor is None:
+            return 0
+        self._held.append(tensor)
+        return tensor.data_ptr()
+
+    def _linear(self, number: int, stored: Stored, packed: th.Tensor | None) -> list[int]:
+        module = self._program.layers[number]
+        shape = module.out_features, module.in_features
+        structure = stored.structure
+        self._held.append(structure)
+        addresses = (0,) * 5 if structure is None else structure.addresses
+        turned = None if structure is None else _empty(structure.nnz)
+        dense = None
+        if self._captures(number):
+            dense = self._dense_grads[number] = _empty(shape[0] * shape[1])
+        if module.bias is not None:
+            check_readable(module.bias)
+        return [
+            *shape,
+            *addresses,
+            self._address(stored.numbers if packed is None else packed),
+            self._address(module.bias),
+            self._address(turned),
+            self._grad_at(module.weight),
+            self._grad_at(module.bias),
+            self._address(dense),
+        ]
+
+    def _captures(self, number: int) -> bool:
+        weight = self._program.layers[number].weight
+        return any(
+            slot.tensor is weight
+            for m in self._program.minimised if m.captured
+            for slot in self._program.slots[slice(*m.slots)]
+        )  # fmt: skip
+
+    def _parameter(self, slot: Slot, packed: dict[int, th.Tensor]) -> list[int]:
+        number, flat, mask = slot.tensor, None, None
+        if slot.layer is not None:
+            stored = self._stored[slot.layer]
+            number, flat, mask = stored.numbers, stored.flat, stored.mask
+        check_readable(number)
+        first = second = steps = None
+        if slot.optimizer is not None and self._steps[id(slot.optimizer)]:
+            found = moments_of(slot.optimizer, slot.tensor)
+            assert found is not None
+            first, second, steps = found
+            for moment in (first, second):
+                if moment is not None:
+                    check_readable(moment)
+            if steps is None:
+                steps = _empty(1)
+        decay = self._controller.weight_decay if id(slot.tensor) in self._decayed else 0.0
+        return [
+            self._count(slot),
+            self._address(number),
+            self._address(flat),
+            self._address(mask),
+            self._address(None if slot.layer is None else packed.get(slot.layer)),
+            self._grad_at(slot.tensor),
+            self._address(first),
+            self._address(second),
+            self._address(steps),
+            self._groups.get(id(slot.tensor), 0),
+            bits_of(decay),
+        ]
+
+    def passed(self, minimised: Minimised) -> None:
+        """Count a step where the optimizer's counters are no tensors."""
+        for slot in self._program.slots[slice(*minimised.slots)]:
+            state = minimised.optimizer.state[slot.tensor]
+            if not isinstance(state["step"], th.Tensor):
+                state["step"] += 1
+
+    def hand_over(self, minimised: Minimised) -> None:
+        """Give torch's parameters the gradients that the kernels have computed."""
+        for group in minimised.optimizer.param_groups:
+            for parameter in group["params"]:
+                parameter.grad = None
+        for slot in self._program.slots[slice(*minimised.slots)]:
+            at, count = self._places[id(slot.tensor)]
+            grad = self._grads[at : at + count].clone()
+            stored = None if slot.layer is None else self._stored[slot.layer]
+            if stored is not None and stored.flat is not None:
+                dense = _empty(slot.tensor.numel())
+                dense[stored.flat.long()] = grad
+                grad = dense
+            slot.tensor.grad = grad.view(slot.tensor.shape)
+            if stored is not None and stored.layer is not None and minimised.captured:
+                assert slot.layer is not None
+                dense = self._dense_grads[slot.layer].clone()
+                self._controller.note_gradient(stored.layer, dense.view(stored.layer.shape))

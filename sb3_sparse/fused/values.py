@@ -1,0 +1,233 @@
+"""Values of a program: what losses are written with."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Union
+
+if TYPE_CHECKING:
+    from sb3_sparse.fused.program import Program
+
+Number = Union["Value", float]
+Back = Callable[["Value"], "Value"]
+"""The share of a parent in the gradient of a value."""
+
+
+class Value:
+    """Numbers ``[batch, features]`` of a program, or ``[features]`` that the whole batch shares.
+
+    Arithmetic records operations and gives new values. Features are broadcast: one goes with any
+    number of them.
+
+    :param program: which records
+    :param features: how many
+    :param batched: whether each entry of the batch has its own
+    :param parents: what it was made of, each with its share in the gradient
+    """
+
+    def __init__(
+        self,
+        program: Program,
+        features: int,
+        batched: bool,
+        parents: tuple[tuple[Value, Back], ...] = (),
+    ) -> None:
+        self.program = program
+        self.features = features
+        self.batched = batched
+        self.parents = parents
+        self.root = self
+        self.offset = 0
+        self.origin = 0
+        """Of a gradient that is there for some features alone: the first of them."""
+        self.gated = False
+        """Whether a gradient is 0 already where the ReLU in front of it is."""
+        program.values.append(self)
+
+    def view(self, first: int, last: int) -> Value:
+        """Features ``first`` to ``last`` of it, in place."""
+        found = Value(self.program, last - first, self.batched)
+        found.root, found.offset = self.root, self.offset + first
+        return found
+
+    def detach(self) -> Value:
+        """The same numbers, through which no gradient flows."""
+        return self.view(0, self.features)
+
+    def __getitem__(self, part: slice) -> Value:
+        first, last, _ = part.indices(self.features)
+        found = self.view(first, last)
+        found.parents = ((self, lambda g: self._embedded(g, first, last)),)
+        return found
+
+    def _embedded(self, g: Value, first: int, last: int) -> Value:
+        whole = Value(self.program, self.features, self.batched)
+        self.program.record("COPY", whole, self.program.constant(0.0))
+        self.program.record("COPY", whole.view(first, last), g)
+        return whole
+
+    # Arithmetic
+
+    def _made(self, kind: str, *others: Number, back: tuple[Back, ...] = ()) -> Value:
+        operands = (self, *map(self.program.value, others))
+        parents = tuple(zip(operands, back, strict=False))
+        features = max(value.features for value in operands)
+        batched = any(value.batched for value in operands)
+        made = Value(self.program, features, batched, parents)
+        self.program.record(kind, made, *operands)
+        return made
+
+    def __add__(self, other: Number) -> Value:
+        return self._made("ADD", other, back=(lambda g: g, lambda g: g))
+
+    def __sub__(self, other: Number) -> Value:
+        return self._made("SUBTRACT", other, back=(lambda g: g, lambda g: -g))
+
+    def __mul__(self, other: Number) -> Value:
+        other = self.program.value(other)
+        return self._made("MULTIPLY", other, back=(lambda g: g * other, lambda g: g * self))
+
+    def __truediv__(self, other: Number) -> Value:
+        other = self.program.value(other)
+        made = self._made("DIVIDE", other)
+        made.parents = ((self, lambda g: g / other), (other, lambda g: -(g * made / other)))
+        return made
+
+    def __neg__(self) -> Value:
+        return self * -1.0
+
+    def __radd__(self, other: float) -> Value:
+        return self + other
+
+    def __rsub__(self, other: float) -> Value:
+        return self.program.value(other) - self
+
+    def __rmul__(self, other: float) -> Value:
+        return self * other
+
+    # Comparisons: 1.0 where they hold, else 0.0
+
+    def less(self, other: Number) -> Value:
+        """Whether it is less."""
+        return self._made("LESS", other)
+
+    def same(self, other: Number) -> Value:
+        """Whether it is equal."""
+        return self._made("SAME", other)
+
+    def first_least(self, other: Value) -> Value:
+        """The lesser of two; where they are equal the gradient is the first one's."""
+        return self._made(
+            "LEAST",
+            other,
+            back=(lambda g: g * (1.0 - other.less(self)), lambda g: g * other.less(self)),
+        )
+
+    def least(self, other: Value) -> Value:
+        """The lesser of two; where they are equal each gets half of the gradient."""
+
+        def back(one: Value, two: Value) -> Back:
+            return lambda g: g * (one.less(two) + one.same(two) * 0.5)
+
+        return self._made("LEAST", other, back=(back(self, other), back(other, self)))
+
+    def clamp(self, least: Number, most: Number) -> Value:
+        """Brought between bounds; the gradient is 0 beyond them."""
+        return self._made(
+            "CLAMP", least, most, back=(lambda g: g * self._made("INSIDE", least, most),)
+        )
+
+    # Functions
+
+    def exp(self) -> Value:
+        """``e^x``."""
+        made = self._made("EXP")
+        made.parents = ((self, lambda g: g * made),)
+        return made
+
+    def log(self) -> Value:
+        """The natural logarithm."""
+        return self._made("LOG", back=(lambda g: g / self,))
+
+    def sqrt(self) -> Value:
+        """The square root."""
+        made = self._made("SQRT")
+        made.parents = ((self, lambda g: g * 0.5 / made),)
+        return made
+
+    def abs(self) -> Value:
+        """The magnitude; it has no gradient here."""
+        return self._made("ABS")
+
+    def square(self) -> Value:
+        """The square."""
+        return self._made("MULTIPLY", self, back=(lambda g: g * (self * 2.0),))
+
+    def huber(self) -> Value:
+        """Smooth L1: half the square up to 1, then linear."""
+        return self._made("HUBER", back=(lambda g: g * self.clamp(-1.0, 1.0),))
+
+    def tanh(self) -> Value:
+        """The hyperbolic tangent."""
+        made = self.program.activated(self, "TANH")
+        made.parents = ((self, lambda g: g * (1.0 - made.square())),)
+        return made
+
+    def sigmoid(self) -> Value:
+        """``1 / (1 + e^-x)``."""
+        made = self.program.activated(self, "SIGMOID")
+        made.parents = ((self, lambda g: g * (made * (1.0 - made))),)
+        return made
+
+    def softplus(self) -> Value:
+        """``log(1 + e^x)``."""
+        made = self.program.activated(self, "SOFTPLUS", 1.0, 20.0)
+        made.parents = ((self, lambda g: g * self.sigmoid()),)
+        return made
+
+    # Sums
+
+    def sum_features(self) -> Value:
+        """The sum over features."""
+        made = Value(self.program, 1, self.batched, ((self, lambda g: g),))
+        self.program.record("SUM_FEATURES", made, self, first=self.features)
+        return made
+
+    def max_features(self) -> Value:
+        """The greatest feature; it has no gradient here."""
+        made = Value(self.program, 1, self.batched)
+        self.program.record("MAX_FEATURES", made, self, first=self.features)
+        return made
+
+    def pick(self, index: Value) -> Value:
+        """The feature whose number is ``index``."""
+        made = Value(self.program, 1, self.batched)
+
+        def back(g: Value) -> Value:
+            put = Value(self.program, self.features, self.batched)
+            self.program.record("PUT", put, g, index)
+            return put
+
+        made.parents = ((self, back),)
+        self.program.record("PICK", made, self, index, first=self.features)
+        return made
+
+    def sum(self) -> Value:
+        """The sum over the batch, by features."""
+        made = Value(self.program, self.features, False)
+
+        def back(g: Value) -> Value:
+            filled = Value(self.program, self.features, True)
+            self.program.record("FILL", filled, g)
+            return filled
+
+        made.parents = ((self, back),)
+        self.program.record("SUM_BATCH", made, self, tiled=False)
+        return made
+
+    def mean(self) -> Value:
+        """The mean over batch and features."""
+        total = self.sum()
+        if self.features > 1:
+            total = total.sum_features()
+        return total * (self.program.scalar("1 / batch") * (1.0 / self.features))
