@@ -12,7 +12,6 @@ from torch import nn
 from torch.utils.hooks import RemovableHandle
 
 from sb3_sparse.engine.auto import AutoCompute
-from sb3_sparse.engine.compact import CompactLayer, compacted
 from sb3_sparse.engine.foreign import watch
 from sb3_sparse.engine.gradients import GradientMask
 from sb3_sparse.engine.hooks import Hooks
@@ -85,6 +84,9 @@ class Controller:
         """Every optimizer that owns a network, once."""
         return list({id(n.optimizer): n.optimizer for n in self.networks}.values())
 
+    def _owned_by(self, optimizer: th.optim.Optimizer) -> list[SparseNetwork]:
+        return [network for network in self.networks if network.optimizer is optimizer]
+
     def attach(self) -> None:
         """Register the hooks, unless they already are on these very weights and optimizers."""
         changed = self._attach_to_gradients()
@@ -119,7 +121,7 @@ class Controller:
             ]
             after = self._trust
             if not acts_elementwise(optimizer):
-                owned = [n.layers for n in self.networks if n.optimizer is optimizer]
+                owned = [network.layers for network in self._owned_by(optimizer)]
                 check_masked(optimizer, chain.from_iterable(owned))
                 after = self._after_step
             handles.append(optimizer.register_step_post_hook(after))
@@ -133,10 +135,7 @@ class Controller:
         :raises UnsupportedError: if their optimizer needs matrices
         """
         for network in self.networks:
-            network.layers = [
-                compacted(layer, self.optimizers) if names is None or layer.name in names else layer
-                for layer in network.layers
-            ]
+            network.compact(names, self.optimizers)
         self._hook_anew(root)
 
     def choose_storage(self, root: nn.Module) -> None:
@@ -154,10 +153,7 @@ class Controller:
         :param root: the policy
         """
         for network in self.networks:
-            network.layers = [
-                layer.masked(self.optimizers) if isinstance(layer, CompactLayer) else layer
-                for layer in network.layers
-            ]
+            network.expand(self.optimizers)
         self._auto = None
         self._hook_anew(root)
 
@@ -225,9 +221,7 @@ class Controller:
     def _before_step(self, optimizer: th.optim.Optimizer, args: object, kwargs: object) -> None:
         self._attach_to_gradients()  # a layer may have been frozen until now
         self._settle_moments(optimizer)
-        for network in self.networks:
-            if network.optimizer is not optimizer:
-                continue
+        for network in self._owned_by(optimizer):
             network.clock += 1
             if self.plan is None and not self._warned and network.denser:
                 self._warned = True
@@ -242,15 +236,13 @@ class Controller:
 
     def _trust(self, optimizer: th.optim.Optimizer, args: object, kwargs: object) -> None:
         """Of optimizers that keep a weight at 0 whose gradient is 0."""
-        for network in self.networks:
-            if network.optimizer is optimizer:
-                network.trust()
+        for network in self._owned_by(optimizer):
+            network.trust()
 
     def _after_step(self, optimizer: th.optim.Optimizer, args: object, kwargs: object) -> None:
         """Of optimizers that write to what is inactive."""
-        for network in self.networks:
-            if network.optimizer is optimizer:
-                network.remask()
+        for network in self._owned_by(optimizer):
+            network.remask()
 
     def awaits(self, optimizer: th.optim.Optimizer) -> bool:
         """Whether the optimizer's next step is more than a step: masks move at it, say."""
@@ -258,23 +250,18 @@ class Controller:
             network.due(self.plan, network.clock + 1, self.progress)
             or (self.plan is None and not self._warned and network.denser)
             or any(layer.moments_stale for layer in network.layers)
-            for network in self.networks
-            if network.optimizer is optimizer
+            for network in self._owned_by(optimizer)
         )
 
     def wants_gradients(self, optimizer: th.optim.Optimizer) -> bool:
         """Whether dense gradients are wanted at the optimizer's next step."""
-        return any(
-            network.wants_gradients(self.plan, self.progress)
-            for network in self.networks
-            if network.optimizer is optimizer
-        )
+        owned = self._owned_by(optimizer)
+        return any(network.wants_gradients(self.plan, self.progress) for network in owned)
 
     def passed(self, optimizer: th.optim.Optimizer) -> None:
         """Count a step that somebody has taken in the optimizer's place."""
-        for network in self.networks:
-            if network.optimizer is optimizer:
-                network.clock += 1
+        for network in self._owned_by(optimizer):
+            network.clock += 1
 
     def note_gradient(self, layer: SparseLayer, dense_grad: th.Tensor) -> None:
         """Hear of a layer's dense gradient at the step that is about to be taken."""

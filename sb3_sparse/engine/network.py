@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 
 import torch as th
 from torch import nn
 
+from sb3_sparse.engine.compact import CompactLayer, compacted
 from sb3_sparse.engine.gradients import DenseGradient, GradientMask
 from sb3_sparse.engine.kernels import Kernel
 from sb3_sparse.engine.layers import SparseLayer
@@ -137,6 +138,26 @@ class SparseNetwork:
                 gain = gains[layer.name]
                 weights = sparsity_aware_weights(mask, seed, layer.name, gain)
                 layer.write(th.from_numpy(weights))
+
+    def compact(
+        self, names: Container[str] | None, optimizers: Sequence[th.optim.Optimizer]
+    ) -> None:
+        """Store linear layers as their active connections from now on.
+
+        :param names: which; None: all
+        :param optimizers: whose moments follow
+        """
+        self.layers = [
+            compacted(layer, optimizers) if names is None or layer.name in names else layer
+            for layer in self.layers
+        ]
+
+    def expand(self, optimizers: Sequence[th.optim.Optimizer]) -> None:
+        """Store every layer masked from now on."""
+        self.layers = [
+            layer.masked(optimizers) if isinstance(layer, CompactLayer) else layer
+            for layer in self.layers
+        ]
 
     def due(self, plan: Plan | None, step: int, progress: float) -> bool:
         """Whether masks move at that gradient step.
