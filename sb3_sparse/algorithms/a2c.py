@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import stable_baselines3
 
 from sb3_sparse.algorithms.on_policy import METHODS, OnPolicy
@@ -61,7 +63,7 @@ class A2C(OnPolicy, stable_baselines3.A2C):
         )
         for data in self.rollout_buffer.get(batch_size=None):
             self._load(machine, data)
-            self._run(machine, data, 0, None)
+            machine.run(0, None, partial(self._refuse, data))
         self._n_updates += 1
         record = self.logger.record
         record("train/n_updates", self._n_updates, exclude="tensorboard")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
@@ -12,7 +13,7 @@ from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
 from sb3_sparse.algorithms.training import Fused, features, parts
 from sb3_sparse.engine.native.library import bits_of
 from sb3_sparse.fused.distributions import bernoulli, categorical, gaussian, multi_categorical
-from sb3_sparse.fused.errors import CheckFailed, NotCovered
+from sb3_sparse.fused.errors import NotCovered
 from sb3_sparse.fused.machine import Machine
 from sb3_sparse.fused.optimizers import KNOWN, Known
 from sb3_sparse.fused.program import Program
@@ -83,15 +84,14 @@ class OnPolicy(Fused, OnPolicyAlgorithm):
                 "returns": data.returns,
             }
         )
-        machine.set({"batch - 1": len(data.advantages) - 1})
 
-    def _run(self, machine: Machine, data: Any, first: int, last: int | None) -> None:
-        try:
-            machine.run(first, last)
-        except CheckFailed:
-            # SB3's distribution refuses what is not finite, and says what it is.
-            self.policy.evaluate_actions(data.observations, data.actions)
-            raise
+    def _refuse(self, data: Any, check: str) -> None:
+        """Let SB3's distribution say what it does not take: means that are not finite, say."""
+        actions = data.actions
+        if isinstance(self.action_space, spaces.Discrete):
+            actions = actions.long().flatten()
+        with th.no_grad():
+            self.policy.evaluate_actions(data.observations, actions)
 
     def _explained_variance(self) -> Any:
         from stable_baselines3.common.utils import explained_variance

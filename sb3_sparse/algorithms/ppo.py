@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from functools import partial
 
 import numpy as np
 import stable_baselines3
@@ -96,7 +97,7 @@ class PPO(OnPolicy, stable_baselines3.PPO):
                 self._load(machine, data)
                 machine.set(settings)
                 step = machine.steps[0] if self.target_kl is not None else None
-                self._run(machine, data, 0, step)
+                machine.run(0, step, partial(self._refuse, data))
                 for name, title in LOGGED.items():
                     logged[title].append(machine.number(name))
                 divergence = machine.number("approx_kl")
@@ -111,7 +112,7 @@ class PPO(OnPolicy, stable_baselines3.PPO):
                         )
                     break
                 if step is not None:
-                    self._run(machine, data, step, None)
+                    machine.run(step)
             self._n_updates += 1
             if not going_on:
                 break

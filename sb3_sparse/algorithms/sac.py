@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -9,9 +10,10 @@ import stable_baselines3
 import torch as th
 from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN
 
-from sb3_sparse.algorithms.training import Fused, features, parts
+from sb3_sparse.algorithms.off_policy import OffPolicy
+from sb3_sparse.algorithms.training import parts
 from sb3_sparse.fused.distributions import least_of, squashed_gaussian
-from sb3_sparse.fused.errors import CheckFailed, NotCovered
+from sb3_sparse.fused.errors import NotCovered
 from sb3_sparse.fused.machine import Machine
 from sb3_sparse.fused.program import Program
 
@@ -22,7 +24,7 @@ METHODS: dict[str, tuple[str, ...]] = {
 }
 
 
-class SAC(Fused, stable_baselines3.SAC):
+class SAC(OffPolicy, stable_baselines3.SAC):
     """Stable-Baselines3's SAC; each gradient step of a sparse policy is one call of the kernels."""
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
@@ -37,25 +39,21 @@ class SAC(Fused, stable_baselines3.SAC):
         optimizers = [self.actor.optimizer, self.critic.optimizer]
         return optimizers + ([self.ent_coef_optimizer] if self.ent_coef_optimizer else [])
 
-    def _machine(self, batch_size: int, n_step: bool) -> Machine:
+    def _machine(self, batch_size: int, source: str) -> Machine:
         policy = self._trains().check(self.policy, METHODS)
-        key = (self.tau, n_step, self.ent_coef_optimizer is None)
+        key = (self.tau, source, self.ent_coef_optimizer is None)
         optimizers = self._optimizers()
         return self._trains().machine(
             policy, (*key, *map(id, optimizers)), batch_size, optimizers,
-            lambda program: self._record(program, n_step),
+            lambda program: self._record(program, source),
         )  # fmt: skip
 
-    def _record(self, program: Program, n_step: bool) -> None:
+    def _record(self, program: Program, source: str) -> None:
         """One gradient step."""
         actor: Any = self.actor
         critic, target = self.critic, self.critic_target
         dim = int(np.prod(self.action_space.shape or ()))
-        width = actor.features_dim
-        obs, next_obs = program.input("obs", width), program.input("next_obs", width)
-        actions = program.input("actions", dim)
-        rewards, dones = program.input("rewards", 1), program.input("dones", 1)
-        discounts = program.input("discounts", 1) if n_step else program.scalar("gamma")
+        batch = self._record_transitions(program, source, actor.features_dim, dim)
 
         def act(obs: Any, noise: str) -> Any:
             latent = program.network(parts(actor.latent_pi), obs)
@@ -68,7 +66,7 @@ class SAC(Fused, stable_baselines3.SAC):
             program.check(log_prob, noise)
             return action, log_prob
 
-        action, log_prob = act(obs, "noise")
+        action, log_prob = act(batch.obs, "noise")
         if self.ent_coef_optimizer is not None:
             assert self.log_ent_coef is not None
             log_ent_coef = program.parameter(self.log_ent_coef)
@@ -81,11 +79,12 @@ class SAC(Fused, stable_baselines3.SAC):
             ent_coef = program.scalar("ent_coef")
         program.log("ent_coef", ent_coef)
 
-        next_action, next_log_prob = act(next_obs, "next_noise")
-        before = program.joined([next_obs, next_action])
+        next_action, next_log_prob = act(batch.next_obs, "next_noise")
+        before = program.joined([batch.next_obs, next_action])
         next_q = least_of([program.network(parts(q), before) for q in target.q_networks])
-        wanted = rewards + (1.0 - dones) * discounts * (next_q - ent_coef * next_log_prob)
-        taken = program.joined([obs, actions])
+        next_value = next_q - ent_coef * next_log_prob
+        wanted = batch.rewards + batch.going_on * batch.discounts * next_value
+        taken = program.joined([batch.obs, batch.actions])
         losses = [
             (program.network(parts(q), taken) - wanted.detach()).square().mean()
             for q in critic.q_networks
@@ -94,7 +93,7 @@ class SAC(Fused, stable_baselines3.SAC):
         program.log("critic_loss", critic_loss)
         program.minimise(critic_loss, critic.optimizer)
 
-        now = program.joined([obs, action])
+        now = program.joined([batch.obs, action])
         q = least_of([program.network(parts(q), now) for q in critic.q_networks])
         actor_loss = (ent_coef * log_prob - q).mean()
         program.log("actor_loss", actor_loss)
@@ -106,22 +105,19 @@ class SAC(Fused, stable_baselines3.SAC):
     def _train_fused(self, gradient_steps: int, batch_size: int) -> None:
         self.policy.set_training_mode(True)
         self._update_learning_rate(self._optimizers())
-        assert self.replay_buffer is not None
+        source = self._find_source()
+        shape = (batch_size, *(self.action_space.shape or ()))
         logged: dict[str, list[float]] = {}
         for step in range(gradient_steps):
-            n_step = hasattr(self.replay_buffer, "n_steps")
-            machine = self._machine(batch_size, n_step)
+            machine = self._machine(batch_size, source)
             machine.prepare()
-            data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
-            self._load(machine, data)
+            data = self._next_batch(machine, source, batch_size)
+            machine.inputs.load({"noise": th.randn(shape), "next_noise": th.randn(shape)})
+            machine.set({"target_entropy": float(self.target_entropy)})
+            if self.ent_coef_optimizer is None:
+                machine.set({"ent_coef": float(self.ent_coef_tensor)})
             last = None if step % self.target_update_interval == 0 else machine.marks["followed"]
-            try:
-                machine.run(0, last)
-            except CheckFailed as failed:
-                # SB3's distribution refuses what is not finite, and says what it is.
-                first = str(failed) == "noise"
-                self.actor.action_log_prob(data.observations if first else data.next_observations)
-                raise
+            machine.run(0, last, partial(self._refuse, machine, data))
             for name in machine.program.logged:
                 logged.setdefault(name, []).append(machine.number(name))
         self._n_updates += gradient_steps
@@ -130,21 +126,8 @@ class SAC(Fused, stable_baselines3.SAC):
             if name in logged:
                 self.logger.record(f"train/{name}", np.mean(logged[name]))
 
-    def _load(self, machine: Machine, data: Any) -> None:
-        shape = data.actions.shape
-        rows = {
-            "obs": features(self.policy, data.observations),
-            "next_obs": features(self.policy, data.next_observations),
-            "actions": data.actions,
-            "rewards": data.rewards,
-            "dones": data.dones,
-            "noise": th.randn(shape),
-            "next_noise": th.randn(shape),
-        }
-        if data.discounts is not None:
-            rows["discounts"] = data.discounts
-        machine.load(rows)
-        scalars: dict[str, Any] = {"gamma": self.gamma, "target_entropy": self.target_entropy}
-        if self.ent_coef_optimizer is None:
-            scalars["ent_coef"] = float(self.ent_coef_tensor)
-        machine.set(scalars)
+    def _refuse(self, machine: Machine, data: Any, noise: str) -> None:
+        """Let SB3's distribution say what it does not take: means that are not finite, say."""
+        obs = self._observations(machine, data, next_ones=noise == "next_noise")
+        with th.no_grad(), th.random.fork_rng(devices=[]):
+            self.actor.action_log_prob(obs)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import stable_baselines3
 import torch as th
 
-from sb3_sparse.algorithms.training import Fused, features, parts
+from sb3_sparse.algorithms.off_policy import OffPolicy
+from sb3_sparse.algorithms.training import parts
 from sb3_sparse.fused.distributions import least_of
 from sb3_sparse.fused.errors import NotCovered
 from sb3_sparse.fused.machine import Machine
@@ -22,7 +21,7 @@ METHODS: dict[str, tuple[str, ...]] = {
 }
 
 
-class TD3(Fused, stable_baselines3.TD3):
+class TD3(OffPolicy, stable_baselines3.TD3):
     """Stable-Baselines3's TD3; each gradient step of a sparse policy is one call of the kernels."""
 
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:
@@ -33,30 +32,26 @@ class TD3(Fused, stable_baselines3.TD3):
             self._not_covered(why)
             super().train(gradient_steps, batch_size)
 
-    def _machine(self, batch_size: int, n_step: bool, delayed: bool) -> Machine:
+    def _machine(self, batch_size: int, source: str, delayed: bool) -> Machine:
         policy = self._trains().check(self.policy, METHODS)
         optimizers = [self.critic.optimizer, self.actor.optimizer]
-        key = (self.tau, n_step, *map(id, optimizers))
+        key = (self.tau, source, *map(id, optimizers))
         return self._trains().machine(
             policy, key, batch_size, optimizers if delayed else optimizers[:1],
-            lambda program: self._record(program, n_step),
+            lambda program: self._record(program, source),
         )  # fmt: skip
 
-    def _record(self, program: Program, n_step: bool) -> None:
+    def _record(self, program: Program, source: str) -> None:
         """One gradient step; the actor's part is behind the mark."""
         dim = int(np.prod(self.action_space.shape or ()))
-        width = self.actor.features_dim
-        obs, next_obs = program.input("obs", width), program.input("next_obs", width)
-        actions, noise = program.input("actions", dim), program.input("noise", dim)
-        rewards, dones = program.input("rewards", 1), program.input("dones", 1)
-        discounts = program.input("discounts", 1) if n_step else program.scalar("gamma")
-
-        next_action = program.network(parts(self.actor_target.mu), next_obs) + noise
-        before = program.joined([next_obs, next_action.clamp(-1.0, 1.0)])
+        batch = self._record_transitions(program, source, self.actor.features_dim, dim)
+        next_action = program.network(parts(self.actor_target.mu), batch.next_obs)
+        next_action = (next_action + program.input("noise", dim)).clamp(-1.0, 1.0)
+        before = program.joined([batch.next_obs, next_action])
         targets = self.critic_target.q_networks
         next_q = least_of([program.network(parts(q), before) for q in targets])
-        wanted = (rewards + (1.0 - dones) * discounts * next_q).detach()
-        taken = program.joined([obs, actions])
+        wanted = (batch.rewards + batch.going_on * batch.discounts * next_q).detach()
+        taken = program.joined([batch.obs, batch.actions])
         losses = [
             (program.network(parts(q), taken) - wanted).square().mean()
             for q in self.critic.q_networks
@@ -66,8 +61,8 @@ class TD3(Fused, stable_baselines3.TD3):
         program.minimise(critic_loss, self.critic.optimizer)
 
         program.mark("delayed")
-        action = program.network(parts(self.actor.mu), obs)
-        q1 = program.network(parts(self.critic.q_networks[0]), program.joined([obs, action]))
+        action = program.network(parts(self.actor.mu), batch.obs)
+        q1 = program.network(parts(self.critic.q_networks[0]), program.joined([batch.obs, action]))
         actor_loss = -q1.mean()
         program.log("actor_loss", actor_loss)
         program.minimise(actor_loss, self.actor.optimizer)
@@ -78,15 +73,18 @@ class TD3(Fused, stable_baselines3.TD3):
     def _train_fused(self, gradient_steps: int, batch_size: int) -> None:
         self.policy.set_training_mode(True)
         self._update_learning_rate([self.actor.optimizer, self.critic.optimizer])
-        assert self.replay_buffer is not None
+        source = self._find_source()
+        shape = (batch_size, *(self.action_space.shape or ()))
         actor_losses, critic_losses = [], []
         for _ in range(gradient_steps):
             delayed = (self._n_updates + 1) % self.policy_delay == 0
-            machine = self._machine(batch_size, hasattr(self.replay_buffer, "n_steps"), delayed)
+            machine = self._machine(batch_size, source, delayed)
             machine.prepare()
             self._n_updates += 1
-            data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
-            self._load(machine, data)
+            self._next_batch(machine, source, batch_size)
+            noise = th.empty(shape).normal_(0, self.target_policy_noise)
+            noise = noise.clamp_(-self.target_noise_clip, self.target_noise_clip)
+            machine.inputs.load({"noise": noise})
             machine.run(0, None if delayed else machine.marks["delayed"])
             critic_losses.append(machine.number("critic_loss"))
             if delayed:
@@ -95,21 +93,6 @@ class TD3(Fused, stable_baselines3.TD3):
         if actor_losses:
             self.logger.record("train/actor_loss", np.mean(actor_losses))
         self.logger.record("train/critic_loss", np.mean(critic_losses))
-
-    def _load(self, machine: Machine, data: Any) -> None:
-        noise = th.empty(data.actions.shape).normal_(0, self.target_policy_noise)
-        rows = {
-            "obs": features(self.policy, data.observations),
-            "next_obs": features(self.policy, data.next_observations),
-            "actions": data.actions,
-            "rewards": data.rewards,
-            "dones": data.dones,
-            "noise": noise.clamp(-self.target_noise_clip, self.target_noise_clip),
-        }
-        if data.discounts is not None:
-            rows["discounts"] = data.discounts
-        machine.load(rows)
-        machine.set({"gamma": self.gamma})
 
 
 class DDPG(TD3, stable_baselines3.DDPG):

@@ -3,23 +3,20 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
+import numpy as np
 import torch as th
 
 from sb3_sparse.engine.controller import Controller
 from sb3_sparse.engine.native.library import bits_of, library
-from sb3_sparse.fused.errors import CheckFailed, NotCovered
+from sb3_sparse.fused.inputs import Inputs
 from sb3_sparse.fused.memory import TILE, lay_out
 from sb3_sparse.fused.operations import KINDS, in_phases
 from sb3_sparse.fused.program import Minimised, Program
 from sb3_sparse.fused.tables import Tables
 from sb3_sparse.fused.values import Value
-
-TYPES = {
-    th.float32: 0, th.float64: 1, th.int64: 2, th.int32: 3, th.uint8: 4, th.bool: 4, th.int8: 5
-}  # fmt: skip
 
 
 class Machine:
@@ -50,13 +47,11 @@ class Machine:
         self._logged = {name: self._place(value) for name, value in program.logged.items()}
         fields = [field for operation in self.operations for field in self._fields(operation)]
         self._operations = (ctypes.c_int64 * len(fields))(*fields)
-        self._inputs = (ctypes.c_int64 * max(1, 4 * len(program.rows)))()
-        self._rows = {name: number for number, (name, _) in enumerate(program.rows)}
-        self._features = dict(program.rows)
-        self._held: dict[str, th.Tensor] = {}
+        self.inputs = Inputs(program.rows)
+        self._indices: dict[str, tuple[Any, int]] = {}
         self._argument = (ctypes.c_int64 * 8)()
         self._call = library().sb3_sparse_fused
-        self._batch = 0
+        self.batch = 0
 
     def _index_of(self, operation: Any) -> int:
         return next(i for i, one in enumerate(self.operations) if one is operation)
@@ -96,7 +91,7 @@ class Machine:
         argument: Any = self._argument
         argument[0] = ctypes.addressof(self._operations)
         argument[1:4] = self.tables.addresses
-        argument[4] = ctypes.addressof(self._inputs)
+        argument[4] = self.inputs.address
         argument[6] = th.get_num_threads()
         argument[7] = self.tables.per_thread
 
@@ -107,42 +102,46 @@ class Machine:
                 self._lanes[name][:] = number
 
     def load(self, rows: Mapping[str, th.Tensor]) -> None:
-        """Hand over a batch.
+        """Hand over a batch of tensors.
 
-        :param rows: by name, shapes ``(batch, features)`` or ``(batch,)`` for one feature
+        :param rows: as in :meth:`Inputs.load`
         :raises NotCovered: for numbers of another type or shape
         """
-        batch = 0
-        for name, tensor in rows.items():
-            number = self._rows.get(name)
-            if number is None:
-                continue
-            kind = TYPES.get(tensor.dtype)
-            features = tensor.numel() // max(1, len(tensor))
-            if kind is None or features != self._features[name]:
-                raise NotCovered(f"{name} of {tensor.dtype} and shape {tuple(tensor.shape)}")
-            if not tensor.is_contiguous():
-                tensor = tensor.contiguous()
-            self._held[name] = tensor
-            batch = len(tensor)
-            self._inputs[4 * number : 4 * number + 4] = [tensor.data_ptr(), kind, features, 0]
-        if batch != self._batch:
-            self._batch = batch
+        self.set_batch(self.inputs.load(rows))
+
+    def index(self, name: str, batch: int) -> tuple[Any, int]:
+        """Room for the numbers of a batch's rows, int64, and its address, which stays.
+
+        :param name: of this index
+        """
+        if name not in self._indices:
+            made = np.zeros(self.capacity, dtype=np.int64)
+            self._indices[name] = made, made.ctypes.data
+        array, address = self._indices[name]
+        self.set_batch(batch)
+        return array[:batch], address
+
+    def set_batch(self, batch: int) -> None:
+        """Say how many entries the batch has."""
+        if batch != self.batch:
+            self.batch = batch
             self._argument[5] = batch
-            if "1 / batch" in self._lanes:
-                self._lanes["1 / batch"][:] = 1 / batch
+            self.set({"1 / batch": 1 / batch, "batch - 1": batch - 1})
 
     def number(self, name: str) -> float:
         """What the last run logged under ``name``."""
         return float(self._view[self._logged[name]])
 
-    def run(self, first: int = 0, last: int | None = None) -> None:
+    def run(
+        self, first: int = 0, last: int | None = None, failed: Callable[[str], None] | None = None
+    ) -> None:
         """Run the program, or a range of its operations.
 
         Torch takes the steps of optimizers that the kernels do not know, and those at which masks
         move.
 
-        :raises CheckFailed: at a check, before anything that comes after it
+        :param failed: called with the name of a check that fails, before anything behind it is run;
+            if it returns, the run goes on
         """
         last = len(self.operations) if last is None else last
         for minimised, step in zip(self.program.minimised, self.steps, strict=True):
@@ -152,15 +151,16 @@ class Machine:
                 self.controller.passed(minimised.optimizer)
                 self.tables.passed(minimised)
                 continue
-            self._go(first, step)
+            self._go(first, step, failed)
             self._step_by_torch(minimised)
             first = step + 1
-        self._go(first, last)
+        self._go(first, last, failed)
 
-    def _go(self, first: int, last: int) -> None:
-        failed = self._call(self._argument, first, last)
-        if failed >= 0:
-            raise CheckFailed(self.program.checks[id(self.operations[failed])])
+    def _go(self, first: int, last: int, failed: Callable[[str], None] | None = None) -> None:
+        while (at := self._call(self._argument, first, last)) >= 0:
+            if failed is not None:
+                failed(self.program.checks[id(self.operations[at])])
+            first = at + 1
 
     def _step_by_torch(self, minimised: Minimised) -> None:
         optimizer = minimised.optimizer

@@ -96,7 +96,8 @@ class Program:
     # What comes from outside
 
     def input(self, name: str, features: int) -> Value:
-        """Rows ``[batch, features]`` that each run is handed."""
+        """Rows ``[batch, features]`` that each run is handed; ask for a name once."""
+        assert name not in dict(self.rows)
         value = Value(self, features, True)
         self.record("LOAD_ROWS", value, number=len(self.rows))
         self.rows.append((name, features))

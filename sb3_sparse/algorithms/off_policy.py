@@ -1,0 +1,134 @@
+"""What SAC, TD3, DDPG and DQN have in common: batches of a replay buffer."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+
+from sb3_sparse.algorithms.training import Fused, features
+from sb3_sparse.fused.machine import Machine
+from sb3_sparse.fused.program import Program
+from sb3_sparse.fused.values import Value
+from sb3_sparse.policies.shortcut import takes_vectors
+
+IN_PLACE, SAMPLED, N_STEP = "in place", "sampled", "n-step"
+"""Ways to read a replay buffer: its arrays, or what its own ``sample`` gives."""
+
+
+class Transitions(NamedTuple):
+    """A batch of transitions as values of a program."""
+
+    obs: Value
+    next_obs: Value
+    actions: Value
+    rewards: Value
+    going_on: Value
+    """0 where the episode has ended."""
+    discounts: Value
+
+
+class OffPolicy(Fused, OffPolicyAlgorithm):
+    """An algorithm that learns from a replay buffer."""
+
+    _source: str
+
+    def _find_source(self) -> str:
+        """How to read the replay buffer."""
+        buffer = self.replay_buffer
+        if (
+            type(buffer) is ReplayBuffer
+            and self._vec_normalize_env is None
+            and vars(buffer).keys().isdisjoint(("sample", "_get_samples", "to_torch"))
+            and takes_vectors(self.policy)
+        ):
+            return IN_PLACE
+        return N_STEP if hasattr(buffer, "n_steps") else SAMPLED
+
+    @staticmethod
+    def _record_transitions(
+        program: Program, source: str, observations: int, actions: int
+    ) -> Transitions:
+        """The inputs of a program.
+
+        :param source: how the replay buffer is read
+        :param observations: features of an observation
+        :param actions: numbers of an action
+        """
+        dones = program.input("dones", 1)
+        if source == IN_PLACE:  # an episode that was cut off goes on
+            dones = dones * (1.0 - program.input("timeouts", 1))
+        return Transitions(
+            program.input("obs", observations),
+            program.input("next_obs", observations),
+            program.input("actions", actions),
+            program.input("rewards", 1),
+            1.0 - dones,
+            program.input("discounts", 1) if source == N_STEP else program.scalar("gamma"),
+        )
+
+    def _next_batch(self, machine: Machine, source: str, batch: int) -> Any:
+        """Hand over a batch, of the same random numbers as SB3.
+
+        :return: what the buffer's ``sample`` gave; None if it was not asked
+        """
+        machine.set({"gamma": self.gamma})
+        buffer: Any = self.replay_buffer
+        if source == IN_PLACE:
+            self._point(machine, buffer, batch)
+            return None
+        data = buffer.sample(batch, env=self._vec_normalize_env)
+        rows = {
+            "obs": features(self.policy, data.observations),
+            "next_obs": features(self.policy, data.next_observations),
+            "actions": data.actions,
+            "rewards": data.rewards,
+            "dones": data.dones,
+        }
+        if data.discounts is not None:
+            rows["discounts"] = data.discounts
+        machine.load(rows)
+        return data
+
+    def _observations(self, machine: Machine, data: Any, next_ones: bool) -> th.Tensor:
+        """Those of the batch at hand, as SB3's buffer gives them.
+
+        :param data: what the buffer's ``sample`` gave; None if it was not asked
+        :param next_ones: whether those after the step
+        """
+        if data is not None:
+            found: th.Tensor = data.next_observations if next_ones else data.observations
+            return found
+        buffer: Any = self.replay_buffer
+        later = next_ones and buffer.optimize_memory_usage
+        index, _ = machine.index("next rows" if later else "rows", machine.batch)
+        array = buffer.next_observations if next_ones and not later else buffer.observations
+        rows: th.Tensor = buffer.to_torch(array.reshape(-1, *array.shape[2:])[index])
+        return rows
+
+    @staticmethod
+    def _point(machine: Machine, buffer: ReplayBuffer, batch: int) -> None:
+        """As ``ReplayBuffer.sample``, but the kernels read the rows themselves."""
+        size, count = buffer.buffer_size, buffer.n_envs
+        if buffer.optimize_memory_usage and buffer.full:
+            rows = (np.random.randint(1, size, size=batch) + buffer.pos) % size
+        else:
+            rows = np.random.randint(0, size if buffer.full else buffer.pos, size=batch)
+        envs = np.random.randint(0, high=count, size=(batch,))
+        index, at = machine.index("rows", batch)
+        np.add(rows * count, envs, out=index)
+        if buffer.optimize_memory_usage:
+            later, then = machine.index("next rows", batch)
+            np.add((rows + 1) % size * count, envs, out=later)
+            next_obs = buffer.observations, then
+        else:
+            next_obs = buffer.next_observations, at
+        arrays = {
+            "obs": (buffer.observations, at), "next_obs": next_obs,
+            "actions": (buffer.actions, at), "rewards": (buffer.rewards, at),
+            "dones": (buffer.dones, at), "timeouts": (buffer.timeouts, at),
+        }  # fmt: skip
+        machine.inputs.point(arrays, lead=2)
