@@ -24,10 +24,9 @@ class A2C(OnPolicy, stable_baselines3.A2C):
             super().train()
 
     def _machine(self) -> Machine:
-        policy = self._trains().check(self.policy, METHODS)
         batch = self.rollout_buffer.buffer_size * self.rollout_buffer.n_envs
-        key = (self.normalize_advantage, id(policy.optimizer))
-        return self._trains().machine(policy, key, batch, [policy.optimizer], self._record)
+        key = (self.normalize_advantage,)
+        return self._trains().machine(key, batch, [self.policy.optimizer], self._record)
 
     def _record(self, program: Program) -> None:
         """One gradient step."""
@@ -52,8 +51,8 @@ class A2C(OnPolicy, stable_baselines3.A2C):
     def _train_fused(self) -> None:
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
+        self._trains().begin(self.policy, METHODS)
         machine = self._machine()
-        machine.prepare()
         machine.set(
             {
                 "ent_coef": self.ent_coef,
@@ -61,9 +60,9 @@ class A2C(OnPolicy, stable_baselines3.A2C):
                 "max_grad_norm": self.max_grad_norm,
             }
         )
-        for data in self.rollout_buffer.get(batch_size=None):
-            self._load(machine, data)
-            machine.run(0, None, partial(self._refuse, data))
+        for part in self._minibatches(None):
+            self._hand_over(machine, part)
+            machine.run(0, None, partial(self._refuse, part))
         self._n_updates += 1
         record = self.logger.record
         record("train/n_updates", self._n_updates, exclude="tensorboard")

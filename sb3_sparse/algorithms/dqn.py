@@ -29,10 +29,8 @@ class DQN(OffPolicy, stable_baselines3.DQN):
             super().train(gradient_steps, batch_size)
 
     def _machine(self, batch_size: int, source: str) -> Machine:
-        policy = self._trains().check(self.policy, METHODS)
-        optimizer = policy.optimizer
         return self._trains().machine(
-            policy, (source, id(optimizer)), batch_size, [optimizer],
+            (source,), batch_size, [self.policy.optimizer],
             lambda program: self._record(program, source),
         )  # fmt: skip
 
@@ -49,11 +47,11 @@ class DQN(OffPolicy, stable_baselines3.DQN):
     def _train_fused(self, gradient_steps: int, batch_size: int) -> None:
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
+        self._trains().begin(self.policy, METHODS)
         source = self._find_source()
         losses = []
         for _ in range(gradient_steps):
             machine = self._machine(batch_size, source)
-            machine.prepare()
             self._next_batch(machine, source, batch_size)
             machine.set({"max_grad_norm": self.max_grad_norm})
             machine.run()

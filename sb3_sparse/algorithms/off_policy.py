@@ -10,6 +10,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_sparse.algorithms.training import Fused, features
+from sb3_sparse.fused.inputs import TYPES
 from sb3_sparse.fused.machine import Machine
 from sb3_sparse.fused.program import Program
 from sb3_sparse.fused.values import Value
@@ -44,6 +45,7 @@ class OffPolicy(Fused, OffPolicyAlgorithm):
             and self._vec_normalize_env is None
             and vars(buffer).keys().isdisjoint(("sample", "_get_samples", "to_torch"))
             and takes_vectors(self.policy)
+            and {buffer.observations.dtype.name, buffer.actions.dtype.name} <= TYPES.keys()
         ):
             return IN_PLACE
         return N_STEP if hasattr(buffer, "n_steps") else SAMPLED

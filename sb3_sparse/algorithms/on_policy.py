@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Iterator
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
+from stable_baselines3.common.utils import explained_variance
 
 from sb3_sparse.algorithms.training import Fused, features, parts
 from sb3_sparse.engine.native.library import bits_of
@@ -18,6 +21,7 @@ from sb3_sparse.fused.machine import Machine
 from sb3_sparse.fused.optimizers import KNOWN, Known
 from sb3_sparse.fused.program import Program
 from sb3_sparse.fused.values import Value
+from sb3_sparse.policies.shortcut import takes_vectors
 
 METHODS: dict[str, tuple[str, ...]] = {
     "": (
@@ -29,14 +33,41 @@ METHODS: dict[str, tuple[str, ...]] = {
 }
 
 
-def _rmsprop(group: dict[str, Any]) -> list[int] | None:
-    if group["momentum"] or group["centered"]:
+def _rmsprop(
+    rate: float, alpha: float, epsilon: float, decay: float, *others: Any
+) -> list[int] | None:
+    if any(others):
         return None
-    numbers = (group["lr"], 0.0, group["alpha"], group["eps"], group["weight_decay"])
-    return [1, *map(bits_of, map(float, numbers)), 0]
+    return [1, *map(bits_of, map(float, (rate, 0.0, alpha, epsilon, decay))), 0]
 
 
-KNOWN[RMSpropTFLike] = Known(_rmsprop, ("", "square_avg"))
+KNOWN[RMSpropTFLike] = Known(
+    ("lr", "alpha", "eps", "weight_decay", "momentum", "centered"), _rmsprop, ("", "square_avg")
+)
+
+
+ARRAYS = {
+    "obs": "observations",
+    "actions": "actions",
+    "old_values": "values",
+    "old_log_prob": "log_probs",
+    "advantages": "advantages",
+    "returns": "returns",
+}
+"""Where a rollout buffer has the inputs of a program."""
+
+
+class Minibatch(NamedTuple):
+    """A part of a rollout.
+
+    :param size: of its batch
+    :param data: what the rollout buffer gives; None: programs read its arrays
+    :param rows: numbers of their rows, if so
+    """
+
+    size: int
+    data: Any
+    rows: Any = None
 
 
 class OnPolicy(Fused, OnPolicyAlgorithm):
@@ -73,20 +104,56 @@ class OnPolicy(Fused, OnPolicyAlgorithm):
         return centred / ((centred.square().sum() / advantages.program.scalar("batch - 1")).sqrt()
                           + 1e-8)  # fmt: skip
 
-    def _load(self, machine: Machine, data: Any) -> None:
-        machine.load(
-            {
-                "obs": features(self.policy, data.observations),
-                "actions": data.actions,
-                "old_values": data.old_values,
-                "old_log_prob": data.old_log_prob,
-                "advantages": data.advantages,
-                "returns": data.returns,
-            }
+    def _minibatches(self, size: int | None) -> Iterator[Minibatch]:
+        """The rollout in parts, of the same random numbers as SB3.
+
+        :param size: of a part; None: the whole rollout
+        """
+        buffer: Any = self.rollout_buffer
+        total = buffer.buffer_size * buffer.n_envs
+        if not (
+            type(buffer) is RolloutBuffer
+            and vars(buffer).keys().isdisjoint(("get", "_get_samples", "to_torch"))
+            and takes_vectors(self.policy)
+        ):
+            for data in buffer.get(size):
+                yield Minibatch(len(data.advantages), data)
+            return
+        assert buffer.full
+        order = np.random.permutation(total)
+        if not buffer.generator_ready:
+            for name in ARRAYS.values():
+                setattr(buffer, name, buffer.swap_and_flatten(getattr(buffer, name)))
+            buffer.generator_ready = True
+        for first in range(0, total, size or total):
+            rows = order[first : first + (size or total)]
+            yield Minibatch(len(rows), None, rows)
+
+    def _hand_over(self, machine: Machine, part: Minibatch) -> None:
+        data = part.data
+        if data is not None:
+            machine.load(
+                {
+                    "obs": features(self.policy, data.observations),
+                    "actions": data.actions,
+                    "old_values": data.old_values,
+                    "old_log_prob": data.old_log_prob,
+                    "advantages": data.advantages,
+                    "returns": data.returns,
+                }
+            )
+            return
+        buffer, at = self.rollout_buffer, part.rows.ctypes.data
+        machine.set_batch(part.size)
+        machine.inputs.point(
+            {name: (getattr(buffer, array), at) for name, array in ARRAYS.items()}, lead=1
         )
 
-    def _refuse(self, data: Any, check: str) -> None:
+    def _refuse(self, part: Minibatch, check: str) -> None:
         """Let SB3's distribution say what it does not take: means that are not finite, say."""
+        data, buffer = part.data, self.rollout_buffer
+        if data is None:
+            data = buffer._get_samples(part.rows)
         actions = data.actions
         if isinstance(self.action_space, spaces.Discrete):
             actions = actions.long().flatten()
@@ -94,8 +161,6 @@ class OnPolicy(Fused, OnPolicyAlgorithm):
             self.policy.evaluate_actions(data.observations, actions)
 
     def _explained_variance(self) -> Any:
-        from stable_baselines3.common.utils import explained_variance
-
         buffer = self.rollout_buffer
         return explained_variance(buffer.values.flatten(), buffer.returns.flatten())
 

@@ -33,12 +33,10 @@ class PPO(OnPolicy, stable_baselines3.PPO):
             super().train()
 
     def _machine(self, batch: int) -> Machine:
-        policy = self._trains().check(self.policy, METHODS)
         normalised = self.normalize_advantage and batch > 1
         clipped = self.clip_range_vf is not None
-        key = (normalised, clipped, id(policy.optimizer))
         return self._trains().machine(
-            policy, key, max(batch, self.batch_size), [policy.optimizer],
+            (normalised, clipped), max(batch, self.batch_size), [self.policy.optimizer],
             lambda program: self._record(program, normalised, clipped),
         )  # fmt: skip
 
@@ -85,19 +83,19 @@ class PPO(OnPolicy, stable_baselines3.PPO):
         if self.clip_range_vf is not None:
             settings["clip_range_vf"] = self.clip_range_vf(remaining)  # type: ignore[operator]
         total = self.rollout_buffer.buffer_size * self.rollout_buffer.n_envs
-        self._machine(min(self.batch_size, total)).prepare()  # before anything is drawn
+        self._trains().begin(self.policy, METHODS)
+        self._machine(min(self.batch_size, total))  # before anything is drawn
 
         logged = defaultdict(list)
         going_on = True
         for epoch in range(self.n_epochs):
             divergences = []
-            for data in self.rollout_buffer.get(self.batch_size):
-                machine = self._machine(len(data.advantages))
-                machine.prepare()
-                self._load(machine, data)
+            for part in self._minibatches(self.batch_size):
+                machine = self._machine(part.size)
                 machine.set(settings)
+                self._hand_over(machine, part)
                 step = machine.steps[0] if self.target_kl is not None else None
-                machine.run(0, step, partial(self._refuse, data))
+                machine.run(0, step, partial(self._refuse, part))
                 for name, title in LOGGED.items():
                     logged[title].append(machine.number(name))
                 divergence = machine.number("approx_kl")

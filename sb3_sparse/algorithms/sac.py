@@ -40,11 +40,8 @@ class SAC(OffPolicy, stable_baselines3.SAC):
         return optimizers + ([self.ent_coef_optimizer] if self.ent_coef_optimizer else [])
 
     def _machine(self, batch_size: int, source: str) -> Machine:
-        policy = self._trains().check(self.policy, METHODS)
-        key = (self.tau, source, self.ent_coef_optimizer is None)
-        optimizers = self._optimizers()
         return self._trains().machine(
-            policy, (*key, *map(id, optimizers)), batch_size, optimizers,
+            (self.tau, source), batch_size, self._optimizers(),
             lambda program: self._record(program, source),
         )  # fmt: skip
 
@@ -105,12 +102,14 @@ class SAC(OffPolicy, stable_baselines3.SAC):
     def _train_fused(self, gradient_steps: int, batch_size: int) -> None:
         self.policy.set_training_mode(True)
         self._update_learning_rate(self._optimizers())
+        self._trains().begin(self.policy, METHODS)
+        if self.tau >= 1:
+            raise NotCovered("targets that are copies")
         source = self._find_source()
         shape = (batch_size, *(self.action_space.shape or ()))
         logged: dict[str, list[float]] = {}
         for step in range(gradient_steps):
             machine = self._machine(batch_size, source)
-            machine.prepare()
             data = self._next_batch(machine, source, batch_size)
             machine.inputs.load({"noise": th.randn(shape), "next_noise": th.randn(shape)})
             machine.set({"target_entropy": float(self.target_entropy)})

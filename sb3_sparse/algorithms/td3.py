@@ -33,11 +33,9 @@ class TD3(OffPolicy, stable_baselines3.TD3):
             super().train(gradient_steps, batch_size)
 
     def _machine(self, batch_size: int, source: str, delayed: bool) -> Machine:
-        policy = self._trains().check(self.policy, METHODS)
         optimizers = [self.critic.optimizer, self.actor.optimizer]
-        key = (self.tau, source, *map(id, optimizers))
         return self._trains().machine(
-            policy, key, batch_size, optimizers if delayed else optimizers[:1],
+            (self.tau, source), batch_size, optimizers if delayed else optimizers[:1],
             lambda program: self._record(program, source),
         )  # fmt: skip
 
@@ -73,13 +71,15 @@ class TD3(OffPolicy, stable_baselines3.TD3):
     def _train_fused(self, gradient_steps: int, batch_size: int) -> None:
         self.policy.set_training_mode(True)
         self._update_learning_rate([self.actor.optimizer, self.critic.optimizer])
+        self._trains().begin(self.policy, METHODS)
+        if self.tau >= 1:
+            raise NotCovered("targets that are copies")
         source = self._find_source()
         shape = (batch_size, *(self.action_space.shape or ()))
         actor_losses, critic_losses = [], []
         for _ in range(gradient_steps):
             delayed = (self._n_updates + 1) % self.policy_delay == 0
             machine = self._machine(batch_size, source, delayed)
-            machine.prepare()
             self._n_updates += 1
             self._next_batch(machine, source, batch_size)
             noise = th.empty(shape).normal_(0, self.target_policy_noise)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterable
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from itertools import chain
-from operator import itemgetter
+from operator import attrgetter, itemgetter
 from typing import Any
 
 import torch as th
@@ -25,6 +25,7 @@ from sb3_sparse.policies.mixin import SparsePolicyMixin
 from sb3_sparse.policies.shortcut import takes_vectors, untouched
 
 HOOKS = itemgetter("_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_pre_hooks")
+SEEN = attrgetter("requires_grad", "_backward_hooks", "_post_accumulate_grad_hooks")
 Build = Callable[[Program], None]
 
 
@@ -36,6 +37,9 @@ class Training:
         self._watch: Watch | None = None
         self._hooked: list[dict[str, Any]] = []
         self._tensors: list[Any] = []
+        self._seen: list[Any] = []
+        self._policy: Any = None
+        self._prepared: Machine | None = None
         self.reason: str | None = None
         """Why gradient steps are SB3's own; None: they are fused."""
 
@@ -45,8 +49,8 @@ class Training:
     def __reduce__(self) -> Any:
         return Training, ()
 
-    def check(self, policy: BasePolicy, methods: dict[str, tuple[str, ...]]) -> SparsePolicyMixin:
-        """The policy, whose modules are all ones that programs know.
+    def begin(self, policy: BasePolicy, methods: dict[str, tuple[str, ...]]) -> None:
+        """Look at the policy before a round of gradient steps.
 
         :param methods: by the dotted name of a module ("": the policy), those that SB3's
             ``train()`` calls
@@ -64,39 +68,45 @@ class Training:
             self._watch = Watch(modules)
         if any(chain.from_iterable(map(HOOKS, self._hooked))) or _has_any_global_hook():  # type: ignore[no-untyped-call]
             raise NotCovered("hooks on modules")
-        if any(map(_is_watched, self._tensors)):
-            raise NotCovered("hooks on parameters")
-        if not all(tensor.requires_grad for tensor in self._tensors if tensor.is_leaf) and any(
-            not parameter.requires_grad for parameter in _trained(policy)
-        ):
-            raise NotCovered("parameters that are frozen")
+        found = chain.from_iterable(map(SEEN, self._tensors))
+        seen = [len(hooks) if hooks and hooks is not True else hooks for hooks in found]
+        if seen != self._seen:
+            self._seen = []
+            if any(map(_is_watched, self._tensors)):
+                raise NotCovered("hooks on parameters")
+            if not all(parameter.requires_grad for parameter in _trained(policy)):
+                raise NotCovered("parameters that are frozen")
+            self._seen = seen
         if th.is_autocast_enabled("cpu") or th.is_anomaly_enabled():
             raise NotCovered("autocast or anomaly detection")
-        return policy
+        self._policy, self._prepared = policy, None
 
     def machine(
         self,
-        policy: SparsePolicyMixin,
-        key: Hashable,
+        key: tuple[Hashable, ...],
         batch: int,
-        optimizers: Iterable[th.optim.Optimizer],
+        optimizers: Sequence[th.optim.Optimizer],
         build: Build,
     ) -> Machine:
         """What runs the next gradient step.
 
-        :param key: what a program depends on beside the policy
+        :param key: what a program depends on beside policy and optimizers
         :param batch: the largest there will be
         :param optimizers: those that will take a step
         :param build: records the program
+        :raises NotCovered: if programs cannot compute it
         """
-        sparse = policy.sparse
+        sparse = self._policy.sparse
         capture = [o for o in optimizers if sparse.awaits(o) and sparse.wants_gradients(o)]
-        whole = (key, tuple(map(id, capture)))
+        whole = (*key, *map(id, optimizers), len(optimizers), *map(id, capture))
         machine = self._machines.get(whole)
         if machine is None or machine.capacity < batch:
             program = Program(capture)
             build(program)
             machine = self._machines[whole] = Machine(program, sparse, batch)
+        if machine is not self._prepared:
+            machine.prepare()
+            self._prepared = machine
         return machine
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Mapping, Sequence
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,11 @@ TYPES = {
     "float32": 0, "float64": 1, "int64": 2, "int32": 3, "uint8": 4, "bool": 4, "int8": 5
 }  # fmt: skip
 Array = NDArray[Any]
+
+
+@cache
+def _name(dtype: th.dtype) -> str:
+    return str(dtype).removeprefix("torch.")
 
 
 class Inputs:
@@ -39,16 +45,18 @@ class Inputs:
         """Read these tensors; the size of the batch.
 
         :param rows: by name, shapes ``(batch, features)``, or ``(batch,)`` for one feature
-        :raises NotCovered: for numbers of another type or shape
+        :raises NotCovered: for numbers of another shape
         """
         batch = 0
         for name, tensor in rows.items():
             if name not in self._numbers:
                 continue
+            kind = _name(tensor.dtype)
+            if kind not in TYPES:
+                tensor, kind = tensor.float(), "float32"
             if not tensor.is_contiguous():
                 tensor = tensor.contiguous()
             batch = len(tensor)
-            kind = str(tensor.dtype).removeprefix("torch.")
             self._put(name, tensor.data_ptr(), kind, tensor.numel() // max(1, batch), 0)
             self._held[name] = tensor
         return batch

@@ -147,9 +147,9 @@ class Machine:
         for minimised, step in zip(self.program.minimised, self.steps, strict=True):
             if not first <= step < last:
                 continue
-            if self.tables.steps(minimised) and not self.controller.awaits(minimised.optimizer):
+            if self.tables.ready(minimised) and not self.controller.awaits(minimised.optimizer):
                 self.controller.passed(minimised.optimizer)
-                self.tables.passed(minimised)
+                self.tables.count(minimised)
                 continue
             self._go(first, step, failed)
             self._step_by_torch(minimised)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from itertools import chain
+from operator import itemgetter
 from typing import Any, NamedTuple
 
 import torch as th
@@ -11,73 +13,137 @@ from torch.optim import optimizer as torch_optimizer
 from sb3_sparse.engine.controller import Controller
 from sb3_sparse.engine.native.library import bits_of
 
-Settings = Callable[[dict[str, Any]], "list[int] | None"]
+FIELDS = 7
+"""Of ``group_t`` of ``fused.h``."""
+Moments = tuple[th.Tensor | None, th.Tensor, th.Tensor | None]
+"""First and second moment, and the counter if it is a tensor."""
 
 
 class Known(NamedTuple):
     """An optimizer that programs know.
 
-    :param settings: ``group_t`` of ``fused.h`` of a parameter group; None for settings that they do
-        not know
+    :param names: settings of a parameter group, in the order in which ``fields`` takes them
+    :param fields: ``group_t`` of ``fused.h``; None for settings that programs do not know
     :param moments: names of what it remembers, the first and the second; "" where it has none
     """
 
-    settings: Settings
+    names: tuple[str, ...]
+    fields: Callable[..., list[int] | None]
     moments: tuple[str, str]
 
 
-def _adam(group: dict[str, Any]) -> list[int] | None:
-    numbers = (group["lr"], *group["betas"], group["eps"], group["weight_decay"])
-    plain = not any(group[name] for name in ("amsgrad", "maximize", "capturable", "differentiable"))
-    if not plain or any(isinstance(number, th.Tensor) for number in numbers):
+def _adam(
+    rate: Any, betas: Any, epsilon: Any, decay: Any, decoupled: bool, *others: bool
+) -> list[int] | None:
+    numbers = (rate, *betas, epsilon, decay)
+    if any(others) or any(isinstance(number, th.Tensor) for number in numbers):
         return None
-    return [0, *map(bits_of, map(float, numbers)), int(group["decoupled_weight_decay"])]
+    return [0, *map(bits_of, map(float, numbers)), int(decoupled)]
 
 
-KNOWN: dict[type[th.optim.Optimizer], Known] = {
-    th.optim.Adam: Known(_adam, ("exp_avg", "exp_avg_sq")),
-    th.optim.AdamW: Known(_adam, ("exp_avg", "exp_avg_sq")),
-}
+_ADAM = Known(
+    (
+        "lr",
+        "betas",
+        "eps",
+        "weight_decay",
+        "decoupled_weight_decay",
+        "amsgrad",
+        "maximize",
+        "capturable",
+        "differentiable",
+    ),
+    _adam,
+    ("exp_avg", "exp_avg_sq"),
+)
+KNOWN: dict[type[th.optim.Optimizer], Known] = {th.optim.Adam: _ADAM, th.optim.AdamW: _ADAM}
 
 
-def settings_of(optimizer: th.optim.Optimizer, controller: Controller) -> list[list[int]] | None:
-    """``group_t`` of each parameter group; None if torch must take the optimizer's steps itself.
+class Steps:
+    """The steps of one optimizer: whether the kernels take them, and with what.
 
-    So it must if the kernels do not know it, or somebody wants to see its steps.
+    :param optimizer: whose
+    :param moved: the parameters that have a gradient
+    :param controller: whose hooks on the optimizer do not count
     """
-    known = KNOWN.get(type(optimizer))
-    if known is None or "step" in vars(optimizer) or _watched(optimizer, controller):
-        return None
-    groups = [known.settings(group) for group in optimizer.param_groups]
-    return None if None in groups else groups  # type: ignore[return-value]
 
+    def __init__(
+        self, optimizer: th.optim.Optimizer, moved: Sequence[th.Tensor], controller: Controller
+    ) -> None:
+        self._optimizer: Any = optimizer
+        self._moved = list(moved)
+        self._controller = controller
+        self._known = KNOWN.get(type(optimizer))
+        self._getter = itemgetter(*self._known.names) if self._known else None
+        self._settings: Any = None
+        self._hooks: Any = None
+        self.groups: list[list[int]] | None = None
+        """``group_t`` of each parameter group; None: torch takes the steps."""
+        self.counts = False
+        """Whether the counters are no tensors, so that somebody else must count."""
 
-def _watched(optimizer: Any, controller: Controller) -> bool:
-    """Whether there are hooks on its steps besides those of the controller."""
-    own = (*optimizer._optimizer_step_pre_hooks.values(),
-           *optimizer._optimizer_step_post_hooks.values())  # fmt: skip
-    every: Any = torch_optimizer
-    everywhere = (*every._global_optimizer_pre_hooks.values(),
-                  *every._global_optimizer_post_hooks.values())  # fmt: skip
-    return any(getattr(hook, "__self__", None) is not controller for hook in own) or any(
-        not hook.__module__.startswith("sb3_sparse.") for hook in everywhere
-    )
+    def refresh(self) -> None:
+        """Look at the settings, and at who watches, now."""
+        if self._known is None or self._getter is None:
+            return
+        optimizer = self._optimizer
+        settings = list(map(self._getter, optimizer.param_groups))
+        hooks = ["step" in vars(optimizer), *map(len, self._hooked())]
+        if settings == self._settings and hooks == self._hooks:
+            return
+        self._settings, self._hooks = settings, hooks
+        self.groups = None
+        if "step" not in vars(optimizer) and not self._watched():
+            groups = [self._known.fields(*group) for group in settings]
+            if None not in groups:
+                self.groups = groups  # type: ignore[assignment]
 
+    def _hooked(self) -> list[dict[Any, Any]]:
+        every: Any = torch_optimizer
+        return [
+            self._optimizer._optimizer_step_pre_hooks,
+            self._optimizer._optimizer_step_post_hooks,
+            every._global_optimizer_pre_hooks,
+            every._global_optimizer_post_hooks,
+        ]
 
-def moments_of(
-    optimizer: th.optim.Optimizer, tensor: th.Tensor
-) -> tuple[th.Tensor | None, th.Tensor, th.Tensor | None] | None:
-    """First moment, second moment and counter; None as long as there are none.
+    def _watched(self) -> bool:
+        """Whether somebody wants to see the steps, besides the controller and this package."""
+        pre, post, *everywhere = self._hooked()
+        own = (*pre.values(), *post.values())
+        every = chain.from_iterable(hooks.values() for hooks in everywhere)
+        return any(getattr(hook, "__self__", None) is not self._controller for hook in own) or any(
+            not hook.__module__.startswith("sb3_sparse.") for hook in every
+        )
 
-    A counter that is no tensor is None.
-    """
-    state = optimizer.state.get(tensor)
-    if not state:
-        return None
-    first, second = KNOWN[type(optimizer)].moments
-    steps = state["step"]
-    return (
-        state[first] if first else None,
-        state[second],
-        steps if isinstance(steps, th.Tensor) else None,
-    )
+    def state(self) -> list[Any]:
+        """Another list as soon as the optimizer remembers other tensors."""
+        if self.groups is None:
+            return [None]
+        state = self._optimizer.state
+        held = [state.get(tensor, {}) for tensor in self._moved]
+        return [len(self.groups), *map(id, chain.from_iterable(map(dict.values, held)))]
+
+    @property
+    def ready(self) -> bool:
+        """Whether the kernels can take the next step: they know it, and there are moments."""
+        return self.groups is not None and all(map(self._optimizer.state.get, self._moved))
+
+    def moments(self, tensor: th.Tensor) -> Moments:
+        """What the optimizer remembers of a parameter."""
+        assert self._known is not None
+        state = self._optimizer.state[tensor]
+        first, second = self._known.moments
+        steps = state["step"]
+        self.counts = not isinstance(steps, th.Tensor)
+        return (
+            state[first] if first else None,
+            state[second],
+            None if self.counts else steps,
+        )
+
+    def count(self) -> None:
+        """Count a step that the kernels have taken, where they cannot count themselves."""
+        if self.counts:
+            for tensor in self._moved:
+                self._optimizer.state[tensor]["step"] += 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -45,25 +46,32 @@ class Storage:
     """The weights of a policy's linear layers.
 
     :param controller: knows the sparse ones
+    :param modules: those whose weights are asked for
     """
 
-    def __init__(self, controller: Controller) -> None:
+    def __init__(self, controller: Controller, modules: Iterable[nn.Linear]) -> None:
         layers = list(controller.layers)
         self._layers = {id(layer.module): layer for layer in layers}
         self._targets = {id(target): layer for layer in layers for target in layer.targets}
+        linear = list(modules)
+        self._compact = [module for module in linear if isinstance(module, CompactLinear)]
+        masked = [self._layers.get(id(module)) for module in linear]
+        self._masked = [layer for layer in masked if isinstance(layer, MaskedLayer)]
+        followers = [(module.weight, self._targets.get(id(module))) for module in linear]
+        self._followers = [
+            weight for weight, layer in followers
+            if isinstance(layer, MaskedLayer) and not layer.always_full
+        ]  # fmt: skip
         self._structures: dict[int, tuple[object, Structure, th.Tensor]] = {}
 
-    def state(self, module: nn.Linear) -> tuple[object, ...]:
-        """Equal as long as what :meth:`of` gives holds."""
-        if isinstance(module, CompactLinear):
-            return module.structure, module.snapshot, module.weight.data_ptr()
-        layer = self._layers.get(id(module))
-        if layer is not None:
-            return layer, layer.connections, module.weight.data_ptr()
-        layer = self._targets.get(id(module))
-        if layer is not None and not layer.always_full:
-            return layer.connections, module.weight._version, module.weight.data_ptr()
-        return (module.weight.data_ptr(),)
+    def state(self) -> list[object]:
+        """Another list as soon as :meth:`of` gives something else, but for where tensors lie."""
+        return [
+            *(module.structure for module in self._compact),
+            *(module.snapshot for module in self._compact if module.is_target),
+            *(layer.connections for layer in self._masked),
+            *(weight._version for weight in self._followers),
+        ]
 
     def of(self, module: nn.Linear, follows: bool) -> Stored:
         """How the weight of a layer is stored now.

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import ctypes
+from itertools import chain
 from typing import Any
 
 import torch as th
 
 from sb3_sparse.engine.controller import Controller
 from sb3_sparse.engine.native.library import bits_of
-from sb3_sparse.fused.optimizers import moments_of, settings_of
+from sb3_sparse.fused.optimizers import FIELDS, Steps
 from sb3_sparse.fused.program import Minimised, Program, Slot
 from sb3_sparse.fused.storage import Storage, Stored, check_readable
 
@@ -35,22 +36,27 @@ class Tables:
     def __init__(self, program: Program, controller: Controller) -> None:
         self._program = program
         self._controller = controller
-        self._storage = Storage(controller)
+        self._storage = Storage(controller, program.layers)
         followed = {
             program.slots[operation.last].layer
             for operation in program.operations
             if operation.kind == "POLYAK"
         }
         self._follows = [number in followed for number in range(len(program.layers))]
-        self._optimizers = {id(m.optimizer): m.optimizer for m in program.minimised}
+        self._steps: dict[int, Steps] = {}
+        for m in program.minimised:
+            tensors = [slot.tensor for slot in program.slots[slice(*m.slots)]]
+            self._steps[id(m.optimizer)] = Steps(m.optimizer, tensors, controller)
+        self._tensors = list({id(slot.tensor): slot.tensor for slot in program.slots}.values())
         self._groups: dict[int, int] = {}
+        self._settings: list[Any] = []
         self._state: Any = None
         self._stored: list[Stored] = []
         self._held: list[Any] = []
         self._grads = _empty(0)
         self._places: dict[int, tuple[int, int]] = {}
+        self._ready: dict[int, bool] = {}
         self._dense_grads: dict[int, th.Tensor] = {}
-        self._steps: dict[int, bool] = {}
         self._arrays: list[Any] = [(ctypes.c_int64 * 1)()] * 3
         self.per_thread = 0
         decayed = controller.weight_decay and {
@@ -63,54 +69,52 @@ class Tables:
         """Of the three tables."""
         return [ctypes.addressof(array) for array in self._arrays]
 
-    def steps(self, minimised: Minimised) -> bool:
-        """Whether the kernels take the optimizer's steps."""
-        return self._steps[id(minimised.optimizer)]
+    def ready(self, minimised: Minimised) -> bool:
+        """Whether the kernels take the optimizer's next step."""
+        return self._ready[id(minimised.optimizer)]
+
+    def count(self, minimised: Minimised) -> None:
+        """Note that the kernels take a step."""
+        self._steps[id(minimised.optimizer)].count()
 
     def refresh(self) -> None:
         """Look where everything is now.
 
         :raises NotCovered: if something is where the kernels cannot read it
         """
-        self._fill_groups()
-        state = self._current_state()
+        steps = self._steps.values()
+        for one in steps:
+            one.refresh()
+        settings = [one.groups for one in steps]
+        if settings != self._settings:
+            self._fill_groups()
+            self._settings = settings
+        state = [
+            *map(th.Tensor.data_ptr, self._tensors),
+            *self._storage.state(),
+            *chain.from_iterable(one.state() for one in steps),
+            th.get_num_threads(),
+        ]
         if state != self._state:
+            self._state = None
             self._fill()
             self._state = state
 
     def _fill_groups(self) -> None:
         fields: list[int] = []
         self._groups = {}
-        for key, optimizer in self._optimizers.items():
-            groups = settings_of(optimizer, self._controller)
-            moved = (
-                s for m in self._program.minimised if m.optimizer is optimizer
-                for s in self._program.slots[slice(*m.slots)]
-            )  # fmt: skip
-            self._steps[key] = groups is not None and all(
-                moments_of(optimizer, slot.tensor) is not None for slot in moved
-            )
-            for group, settings in zip(optimizer.param_groups, groups or [], strict=False):
+        for minimised in self._program.minimised:
+            groups = self._steps[id(minimised.optimizer)].groups or []
+            for group, found in zip(minimised.optimizer.param_groups, groups, strict=False):
                 for parameter in group["params"]:
-                    self._groups[id(parameter)] = len(fields) // 7
-                fields += settings
+                    self._groups[id(parameter)] = len(fields) // FIELDS
+                fields += found
         self._arrays[2] = (ctypes.c_int64 * max(1, len(fields)))(*fields)
-
-    def _current_state(self) -> list[Any]:
-        program = self._program
-        tensors = [slot.tensor.data_ptr() for slot in program.slots]
-        layers = [self._storage.state(module) for module in program.layers]
-        moments: list[Any] = []
-        for slot in program.slots:
-            if slot.optimizer is not None and self._steps[id(slot.optimizer)]:
-                found = moments_of(slot.optimizer, slot.tensor)
-                moments += [t if t is None else t.data_ptr() for t in found or ()]
-        return [tensors, layers, moments, th.get_num_threads(), list(self._groups.values()),
-                list(self._steps.values())]  # fmt: skip
 
     def _fill(self) -> None:
         program = self._program
         self._held = []
+        self._ready = {key: steps.ready for key, steps in self._steps.items()}
         self._stored = [
             self._storage.of(module, follows)
             for module, follows in zip(program.layers, self._follows, strict=True)
@@ -194,10 +198,8 @@ class Tables:
             number, flat, mask = stored.numbers, stored.flat, stored.mask
         check_readable(number)
         first = second = steps = None
-        if slot.optimizer is not None and self._steps[id(slot.optimizer)]:
-            found = moments_of(slot.optimizer, slot.tensor)
-            assert found is not None
-            first, second, steps = found
+        if slot.optimizer is not None and self._ready[id(slot.optimizer)]:
+            first, second, steps = self._steps[id(slot.optimizer)].moments(slot.tensor)
             for moment in (first, second):
                 if moment is not None:
                     check_readable(moment)
@@ -217,13 +219,6 @@ class Tables:
             self._groups.get(id(slot.tensor), 0),
             bits_of(decay),
         ]
-
-    def passed(self, minimised: Minimised) -> None:
-        """Count a step where the optimizer's counters are no tensors."""
-        for slot in self._program.slots[slice(*minimised.slots)]:
-            state = minimised.optimizer.state[slot.tensor]
-            if not isinstance(state["step"], th.Tensor):
-                state["step"] += 1
 
     def hand_over(self, minimised: Minimised) -> None:
         """Give torch's parameters the gradients that the kernels have computed."""
