@@ -17,6 +17,7 @@ from sb3_sparse.algorithms.training import Fused, features, parts
 from sb3_sparse.engine.native.library import bits_of
 from sb3_sparse.fused.distributions import bernoulli, categorical, gaussian, multi_categorical
 from sb3_sparse.fused.errors import NotCovered
+from sb3_sparse.fused.inputs import TYPES
 from sb3_sparse.fused.machine import Machine
 from sb3_sparse.fused.optimizers import KNOWN, Known
 from sb3_sparse.fused.program import Program
@@ -115,6 +116,7 @@ class OnPolicy(Fused, OnPolicyAlgorithm):
             type(buffer) is RolloutBuffer
             and vars(buffer).keys().isdisjoint(("get", "_get_samples", "to_torch"))
             and takes_vectors(self.policy)
+            and {buffer.observations.dtype.name, buffer.actions.dtype.name} <= TYPES.keys()
         ):
             for data in buffer.get(size):
                 yield Minibatch(len(data.advantages), data)

@@ -19,6 +19,14 @@ LOGGED = {
     "value_loss": "train/value_loss",
     "clip_fraction": "train/clip_fraction",
 }
+TITLES = (
+    "train/entropy_loss",
+    "train/policy_gradient_loss",
+    "train/value_loss",
+    "train/approx_kl",
+    "train/clip_fraction",
+)
+"""In SB3's order, in which writers of logs get them."""
 
 
 class PPO(OnPolicy, stable_baselines3.PPO):
@@ -116,9 +124,9 @@ class PPO(OnPolicy, stable_baselines3.PPO):
                 break
 
         record = self.logger.record
-        for title in LOGGED.values():
+        logged["train/approx_kl"] = divergences
+        for title in TITLES:
             record(title, np.mean(logged[title]))
-        record("train/approx_kl", np.mean(divergences))
         record("train/loss", loss)
         record("train/explained_variance", self._explained_variance())
         self._record_std()

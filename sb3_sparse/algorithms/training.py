@@ -158,7 +158,7 @@ def parts(*modules: nn.Module) -> Parts:
     :raises NotCovered: if there is anything else in it
     """
     found = parts_of(modules)
-    if not found:
+    if found is None:
         kinds = {type(m).__name__ for module in modules for m in module.modules()}
         raise NotCovered(f"a network of {', '.join(sorted(kinds))}")
     return found
