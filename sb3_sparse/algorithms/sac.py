@@ -102,7 +102,8 @@ class SAC(OffPolicy, stable_baselines3.SAC):
     def _train_fused(self, gradient_steps: int, batch_size: int) -> None:
         self.policy.set_training_mode(True)
         self._update_learning_rate(self._optimizers())
-        self._trains().begin(self.policy, METHODS)
+        own = () if self.log_ent_coef is None else (self.log_ent_coef,)
+        self._trains().begin(self.policy, METHODS, own)
         if self.tau >= 1:
             raise NotCovered("targets that are copies")
         source = self._find_source()

@@ -15,6 +15,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, Flatten
 from torch import nn
 from torch.nn.modules.module import _has_any_global_hook
 
+from sb3_sparse.engine.activations import ADJUSTABLE, number_of
 from sb3_sparse.engine.native.library import why_missing
 from sb3_sparse.engine.paths import parts_of
 from sb3_sparse.engine.watch import Watch, patched
@@ -23,6 +24,7 @@ from sb3_sparse.fused.machine import Machine
 from sb3_sparse.fused.program import Parts, Program
 from sb3_sparse.policies.mixin import SparsePolicyMixin
 from sb3_sparse.policies.shortcut import takes_vectors, untouched
+from sb3_sparse.policies.storage import KNOWN
 
 HOOKS = itemgetter("_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_pre_hooks")
 SEEN = attrgetter("requires_grad", "_backward_hooks", "_post_accumulate_grad_hooks")
@@ -38,10 +40,15 @@ class Training:
         self._hooked: list[dict[str, Any]] = []
         self._tensors: list[Any] = []
         self._seen: list[Any] = []
+        self._adjustable: list[nn.Module] = []
+        self._acting: list[dict[str, Any]] = []
+        self._settings: list[Any] = []
         self._policy: Any = None
         self._prepared: Machine | None = None
         self.reason: str | None = None
-        """Why gradient steps are SB3's own; None: they are fused."""
+        """Why the last gradient steps were SB3's own; None: they were fused."""
+        self.said: set[str] = set()
+        """Reasons that the log has told."""
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Training:
         return Training()
@@ -49,30 +56,41 @@ class Training:
     def __reduce__(self) -> Any:
         return Training, ()
 
-    def begin(self, policy: BasePolicy, methods: dict[str, tuple[str, ...]]) -> None:
+    def begin(
+        self,
+        policy: BasePolicy,
+        methods: dict[str, tuple[str, ...]],
+        others: Sequence[th.Tensor] = (),
+    ) -> None:
         """Look at the policy before a round of gradient steps.
 
         :param methods: by the dotted name of a module ("": the policy), those that SB3's
             ``train()`` calls
+        :param others: parameters that are trained beside the policy's
         :raises NotCovered: if somebody would notice, or miss, that SB3 does not call them
         """
         if not isinstance(policy, SparsePolicyMixin):
             raise NotCovered(f"the policy, {type(policy).__name__}, is not sparse")
-        if self._watch is None or not self._watch.unchanged():
+        settings = self._settings_now()
+        if self._watch is None or settings != self._settings or not self._watch.unchanged():
             self._watch = None
             self._machines.clear()
             _check_policy(policy, methods)
             modules = list(policy.modules())
             self._hooked = list(map(vars, modules))
             self._tensors = list(policy.parameters())
+            self._adjustable = [m for m in modules if isinstance(m, ADJUSTABLE)]
+            self._acting = [vars(m) for m in modules if "action_dist" in vars(m)]
+            self._settings = self._settings_now()
             self._watch = Watch(modules)
         if any(chain.from_iterable(map(HOOKS, self._hooked))) or _has_any_global_hook():  # type: ignore[no-untyped-call]
             raise NotCovered("hooks on modules")
-        found = chain.from_iterable(map(SEEN, self._tensors))
+        tensors = [*self._tensors, *others]
+        found = chain.from_iterable(map(SEEN, tensors))
         seen = [len(hooks) if hooks and hooks is not True else hooks for hooks in found]
         if seen != self._seen:
             self._seen = []
-            if any(map(_is_watched, self._tensors)):
+            if any(map(_is_watched, tensors)):
                 raise NotCovered("hooks on parameters")
             if not all(parameter.requires_grad for parameter in _trained(policy)):
                 raise NotCovered("parameters that are frozen")
@@ -80,6 +98,11 @@ class Training:
         if th.is_autocast_enabled("cpu") or th.is_anomaly_enabled():
             raise NotCovered("autocast or anomaly detection")
         self._policy, self._prepared = policy, None
+
+    def _settings_now(self) -> list[Any]:
+        """What can change without a module, a tensor or a name that comes or goes."""
+        distributions = [attributes["action_dist"] for attributes in self._acting]
+        return [*map(number_of, self._adjustable), *distributions, *map(type, distributions)]
 
     def machine(
         self,
@@ -107,6 +130,7 @@ class Training:
         if machine is not self._prepared:
             machine.prepare()
             self._prepared = machine
+        self.reason = None
         return machine
 
 
@@ -115,11 +139,14 @@ def _check_policy(policy: SparsePolicyMixin, methods: dict[str, tuple[str, ...]]
         raise NotCovered(f"there are no kernels: {missing}")
     if policy.device.type != "cpu":
         raise NotCovered(f"the policy is on {policy.device}")
-    if getattr(policy, "use_sde", False):
-        raise NotCovered("gSDE")
     for name, module in policy.named_modules():
+        if getattr(module, "use_sde", False):
+            raise NotCovered("gSDE")
         if patched(module):
             raise NotCovered(f"{name or 'the policy'} has methods of its own")
+        distribution: Any = type(getattr(module, "action_dist", None))
+        if distribution.__module__.partition(".")[0] not in (*KNOWN, "builtins"):
+            raise NotCovered(f"the distribution {distribution.__name__}")
     for name, called in methods.items():
         if not untouched(policy.get_submodule(name), called):
             raise NotCovered(f"{name or 'the policy'} has methods of its own")
@@ -195,6 +222,7 @@ class Fused(BaseAlgorithm):
     def _not_covered(self, why: NotCovered) -> None:
         """Say once why gradient steps are SB3's own."""
         training = self._trains()
-        if training.reason != str(why):
-            training.reason = str(why)
+        training.reason = reason = str(why)
+        if reason not in training.said:
+            training.said.add(reason)
             self.logger.debug(f"gradient steps are not fused: {why}")
