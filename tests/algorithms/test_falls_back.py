@@ -1,0 +1,295 @@
+"""What programs do not cover trains by stock ``train()``, to the bit, and the log says once why."""
+
+from __future__ import annotations
+
+import pytest
+import stable_baselines3
+import torch as th
+from algorithms_support import assert_alike, learn, make, reason_of
+from stable_baselines3.common.distributions import (
+    DiagGaussianDistribution,
+    SquashedDiagGaussianDistribution,
+)
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.torch_layers import FlattenExtractor
+from support import TinyDicts, TinyImages
+from torch import nn
+
+import sb3_sparse
+from sb3_sparse.engine.native import library
+from sb3_sparse.policies.actor_critic import SparseActorCriticPolicy
+from sb3_sparse.policies.dqn import SparseDQNPolicy
+from sb3_sparse.policies.sac import SparseSACPolicy
+
+
+class Ear(Logger):
+    """Hears what is said at the level of debugging."""
+
+    def __init__(self) -> None:
+        super().__init__(folder=None, output_formats=[])
+        self.heard: list[str] = []
+
+    def debug(self, *args) -> None:
+        self.heard += map(str, args)
+
+
+def assert_falls_back(name, why, change=lambda model: None, env=lambda: None, steps=None, **kwargs):
+    """Two rounds of training, since the log shall not say it again in the second."""
+    models = []
+    for which in (sb3_sparse, stable_baselines3):
+        arguments = {key: dict(v) if isinstance(v, dict) else v for key, v in kwargs.items()}
+        model = make(which, name, env(), **arguments)
+        change(model)
+        model.set_logger(Ear())
+        for _ in range(2):
+            learn(model, steps=steps)
+        models.append(model)
+    ours, stock = models
+    assert why in reason_of(ours)
+    assert ours.logger.heard == [f"gradient steps are not fused: {reason_of(ours)}"]
+    assert_alike(ours, stock, exact=True)
+
+
+@pytest.mark.parametrize("env", [TinyImages, TinyDicts])
+@pytest.mark.parametrize("name", ["DQN", "A2C"])
+def test_images_and_dict_observations(name, env):
+    why = "CombinedExtractor" if env is TinyDicts else "NatureCNN"
+    kwargs = dict(batch_size=4) if name == "DQN" else {}
+    assert_falls_back(name, why, env=env, steps=25, **kwargs)
+
+
+@pytest.mark.parametrize("name", ["SAC", "PPO", "A2C"])
+def test_exploration_that_depends_on_the_state(name):
+    assert_falls_back(name, "gSDE", use_sde=True)
+
+
+class Halved(FlattenExtractor):
+    def forward(self, obs):
+        return super().forward(obs) * 0.5
+
+
+@pytest.mark.parametrize("name", ["TD3", "PPO"])
+def test_an_extractor_of_the_users_own(name):
+    kwargs = dict(features_extractor_class=Halved)
+    assert_falls_back(name, "features extractor Halved", policy_kwargs=kwargs)
+
+
+@pytest.mark.parametrize("activation", [nn.Softplus, nn.Mish, nn.Hardswish])
+@pytest.mark.parametrize("name", ["SAC", "PPO"])
+def test_other_activations(name, activation):
+    why = f"the activation {activation.__name__}"
+    assert_falls_back(name, why, policy_kwargs=dict(activation_fn=activation))
+
+
+def dropout():
+    return nn.Dropout(0.2)
+
+
+def test_layers_that_are_no_activations():
+    kwargs = dict(activation_fn=dropout)
+    assert_falls_back("DQN", "a network of Dropout, Linear, Sequential", policy_kwargs=kwargs)
+
+
+class Normalised(SparseDQNPolicy):
+    def make_q_net(self):
+        found = super().make_q_net()
+        found.q_net.insert(1, nn.LayerNorm(24))
+        return found
+
+
+def test_normalisation_layers():
+    assert_falls_back("DQN", "LayerNorm", policy=Normalised)
+
+
+def test_a_dense_policy_of_stock():
+    assert_falls_back("SAC", "the policy, SACPolicy, is not sparse", policy="MlpPolicy")
+
+
+def double(module, args, result):
+    return result * 2
+
+
+def hook_module(model):
+    model.policy.critic.register_forward_hook(lambda module, args, result: None)
+
+
+def hook_layer(model):
+    model.policy.actor.latent_pi[0].register_forward_hook(double)
+
+
+def hook_backward(model):
+    layer = model.policy.critic.qf0[2]
+    layer.register_full_backward_hook(lambda module, into, out: (into[0] * 2,))
+
+
+def hook_parameter(model):
+    model.policy.critic.qf0[2].bias.register_hook(lambda grad: grad * 0.5)
+
+
+def halve(grad):
+    grad.mul_(0.5)
+
+
+def hook_accumulated(model):
+    weight = model.policy.actor.mu.bias
+    weight.register_post_accumulate_grad_hook(lambda parameter: halve(parameter.grad))
+
+
+def hook_entropy(model):
+    model.log_ent_coef.register_hook(lambda grad: grad * 0.5)
+
+
+def freeze(model):
+    for parameter in model.policy.critic.qf0[0].parameters():
+        parameter.requires_grad_(False)
+
+
+def freeze_bias(model):
+    model.policy.actor.mu.bias.requires_grad_(False)
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        (hook_module, "hooks on modules"),
+        (hook_layer, "hooks on modules"),
+        (hook_backward, "hooks on modules"),
+        (hook_parameter, "hooks on parameters"),
+        (hook_accumulated, "hooks on parameters"),
+        (hook_entropy, "hooks on parameters"),
+        (freeze, "frozen"),
+        (freeze_bias, "frozen"),
+    ],
+)
+def test_hooks_and_frozen_parameters(change, why):
+    assert_falls_back("SAC", why, change)
+
+
+def test_hooks_on_all_modules():
+    handle = nn.modules.module.register_module_forward_hook(lambda module, args, result: None)
+    try:
+        assert_falls_back("PPO", "hooks on modules")
+    finally:
+        handle.remove()
+
+
+class Doubting(SparseActorCriticPolicy):
+    def evaluate_actions(self, obs, actions):
+        values, log_prob, entropy = super().evaluate_actions(obs, actions)
+        return values * 0.5, log_prob, entropy
+
+
+class Wide(DiagGaussianDistribution):
+    def log_prob(self, actions):
+        return super().log_prob(actions) * 0.5
+
+
+class OwnDistribution(SparseActorCriticPolicy):
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, **kwargs)
+        self.action_dist = Wide(3)
+
+
+class OwnActor(SparseSACPolicy):
+    def make_actor(self, *args, **kwargs):
+        actor = super().make_actor(*args, **kwargs)
+
+        class Scaled(type(actor)):
+            def get_action_dist_params(self, obs):
+                mean, log_std, more = super().get_action_dist_params(obs)
+                return mean * 0.5, log_std, more
+
+        actor.__class__ = Scaled
+        return actor
+
+
+@pytest.mark.parametrize("policy", [Doubting, OwnDistribution])
+@pytest.mark.parametrize("name", ["PPO", "A2C"])
+def test_policies_of_the_users_own_of_rollouts(name, policy):
+    why = "the distribution Wide" if policy is OwnDistribution else "methods of its own"
+    assert_falls_back(name, why, policy=policy)
+
+
+def test_policies_of_the_users_own_of_replay():
+    assert_falls_back("SAC", "of its own", policy=OwnActor)
+
+
+def test_a_distribution_of_the_users_own():
+    class Steep(SquashedDiagGaussianDistribution):
+        def log_prob(self, *args):
+            return super().log_prob(*args) * 0.5
+
+    def replace(model):
+        model.policy.actor.action_dist = Steep(3)
+
+    assert_falls_back("SAC", "the distribution Steep", replace)
+    model = learn(make(sb3_sparse, "SAC"))
+    replace(model)
+    learn(model, steps=5)
+    assert model._trains().reason == "the distribution Steep"
+
+
+def test_a_method_that_somebody_has_put_over_one():
+    def patch(model):
+        forward = model.policy.critic.forward
+        model.policy.critic.forward = lambda *args: tuple(q * 0.5 for q in forward(*args))
+
+    assert_falls_back("TD3", "critic has methods of its own", patch)
+
+
+def test_parts_that_torch_has_compiled():
+    def compile_actor(model):
+        model.policy.actor = model.actor = th.compile(model.policy.actor, backend="eager")
+
+    def compile_policy(model):
+        model.policy = th.compile(model.policy, backend="eager")
+
+    assert_falls_back("SAC", "", compile_actor)
+    assert_falls_back("A2C", "", compile_policy)
+
+
+def test_targets_that_are_copies():
+    assert_falls_back("SAC", "targets that are copies", tau=1.0)
+
+
+def test_anomaly_detection():
+    with th.autograd.detect_anomaly(check_nan=False):
+        assert_falls_back("SAC", "anomaly detection")
+
+
+def test_no_kernels(monkeypatch, tmp_path):
+    monkeypatch.setattr(library, "PATH", tmp_path / "kernels.so")
+    library.library.cache_clear()
+    try:
+        for name in ("SAC", "A2C"):
+            assert_falls_back(name, "there are no kernels: ")
+    finally:
+        library.library.cache_clear()
+
+
+def test_what_comes_and_goes_is_followed():
+    def train(library):
+        model = learn(make(library, "SAC"))
+        handle = model.policy.critic.register_forward_hook(lambda module, args, result: None)
+        learn(model, steps=5)
+        reasons.append(model._trains().reason if library is sb3_sparse else None)
+        handle.remove()
+        return learn(model, steps=5)
+
+    reasons = []
+    ours = train(sb3_sparse)
+    assert_alike(ours, train(stable_baselines3))
+    assert reasons == ["hooks on modules", None]
+    assert ours._trains().reason is None
+
+
+@pytest.mark.parametrize("name", ["SAC", "A2C"])
+def test_settings_of_activations_are_followed(name):
+    def train(library):
+        model = learn(make(library, name, policy_kwargs=dict(activation_fn=nn.LeakyReLU)))
+        for module in model.policy.modules():
+            if isinstance(module, nn.LeakyReLU):
+                module.negative_slope = 0.5
+        return learn(model, steps=10)
+
+    assert_alike(train(sb3_sparse), train(stable_baselines3))
