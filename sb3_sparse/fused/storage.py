@@ -63,10 +63,18 @@ class Storage:
             if isinstance(layer, MaskedLayer) and not layer.always_full
         ]  # fmt: skip
         self._structures: dict[int, tuple[object, Structure, th.Tensor]] = {}
+        self._own: dict[int, tuple[nn.Linear, np.ndarray]] = {}
+        """Targets read by connections of their own, and which of their numbers were not 0."""
+        self._rewritten = 0
 
     def state(self) -> list[object]:
         """Another list as soon as :meth:`of` gives something else, but for where tensors lie."""
+        for key, (module, written) in list(self._own.items()):
+            if not np.array_equal(_written(module), written):  # by a copy that torch did not count
+                del self._own[key]
+                self._rewritten += 1
         return [
+            self._rewritten,
             *(module.structure for module in self._compact),
             *(module.snapshot for module in self._compact if module.is_target),
             *(layer.connections for layer in self._masked),
@@ -98,12 +106,14 @@ class Storage:
             return Stored(weight, structure, flat, layer=layer)
         if not sparse:
             return Stored(weight)
-        written = (weight.detach() != 0).numpy().ravel()
+        written = _written(module)
+        self._own.pop(id(module), None)
         structure, flat = self._structure(id(layer), layer.connections, layer.mask(), layer)
         if not (written & ~layer.mask()).any():
             return Stored(weight, structure, flat)
         if follows:
             raise NotCovered("a target with other connections than its layer")
+        self._own[id(module)] = module, written
         structure, flat = self._structure(id(module), object(), written, layer)
         return Stored(weight, structure, flat)
 
@@ -116,6 +126,11 @@ class Storage:
             flat = th.from_numpy(structure.flat.astype(np.int32))
             kept = self._structures[key] = connections, structure, flat
         return kept[1:]
+
+
+def _written(module: nn.Linear) -> np.ndarray:
+    found: np.ndarray = module.weight.detach().numpy().ravel() != 0
+    return found
 
 
 def check_readable(tensor: th.Tensor) -> None:
