@@ -69,6 +69,15 @@ def test_updates_that_wait_for_the_rollout(name):
     assert ours.policy.sparse.networks[-1].mask_updates > 1
 
 
+@pytest.mark.parametrize("storage", ["masked", "sparse"])
+def test_targets_that_keep_their_connections_until_the_next_copy(storage):
+    kwargs = dict(policy_kwargs_of("set", storage), optimizer_kwargs=dict(eps=1e-2))
+    assert_like_stock(
+        "DQN", lambda: moving("set", update_interval=5), 70, policy_kwargs=kwargs,
+        learning_rate=0.02, target_update_interval=4,
+    )  # fmt: skip
+
+
 WRONG = [
     ("SAC", {}, dict(gamma=0.98)),
     ("SAC", {}, dict(tau=0.006)),
