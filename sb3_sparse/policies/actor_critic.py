@@ -109,10 +109,10 @@ class SparseActorCriticPolicy(SparsePolicyMixin, ActorCriticPolicy):
         return None
 
     def __getattr__(self, name: str) -> Any:
-        for kind in ("_modules", "_parameters"):  # at once: torch looks in more places
-            found = vars(self).get(kind, {}).get(name)
-            if found is not None:
-                return found
+        try:
+            return self.__dict__["_modules"][name]  # before torch looks in other places
+        except KeyError:
+            pass
         if name == "lstm_actor":  # what RecurrentPPO asks for first, before it checks the class
             raise NoSuchPart(
                 "RecurrentPPO has no sparse policy, since an LSTM cannot be masked; PPO, A2C and "

@@ -192,6 +192,40 @@ def test_an_input_that_is_not_contiguous_is_read_right():
     close(Inference.of([[net]])(x)[0], by_modules(net, x))
 
 
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+@pytest.mark.parametrize("count", [1, 4, 16])
+def test_observations_of_any_shape_are_flattened_and_rounded(kind, count, instructions):
+    net = network([6, 4, 3], ["compact", "masked"], nn.Tanh)
+    found = Inference.of([[net]])
+    x = np.random.default_rng(0).normal(size=(count, 2, 3)).astype(kind)
+    expected = by_modules(net, th.from_numpy(x).float().flatten(1))
+    close(found.of_observations(th.from_numpy(x))[0], expected)
+    close(th.from_numpy(found.of_array(x)[0]), expected)
+    turned = np.asfortranarray(x)
+    close(th.from_numpy(found.of_array(turned)[0]), expected)
+    close(found.of_observations(th.from_numpy(turned))[0], expected)
+
+
+@pytest.mark.parametrize(
+    "x",
+    [
+        np.ones((0, 5), np.float32),
+        np.ones((17, 5), np.float32),
+        np.ones((2, 4), np.float32),
+        np.ones((2, 5), int),
+        np.full((2, 5), np.nan, np.float32),
+        np.full((2, 5), 1e300),
+    ],
+)
+def test_arrays_that_it_does_not_take_are_left_to_the_modules(x):
+    found = Inference.of([[network([5, 4, 3], ["masked"], nn.ReLU)]])
+    assert found.of_array(x) is None
+    with th.inference_mode():
+        assert found.of_array(np.ones((2, 5), np.float32)) is not None
+    with th.autocast("cpu"):
+        assert found.of_array(np.ones((2, 5), np.float32)) is None
+
+
 def write(net):
     with th.no_grad():
         net[0].weight.mul_(3)
