@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import ctypes
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from itertools import chain
 from typing import Any, NamedTuple
 
@@ -29,7 +29,7 @@ from sb3_sparse.engine.native.library import bits_of, library, why_missing
 from sb3_sparse.engine.paths import Paths, modules_of, parts_of
 from sb3_sparse.engine.room import Room
 from sb3_sparse.engine.structure import Structure
-from sb3_sparse.engine.watch import Watch, patched
+from sb3_sparse.engine.watch import patched
 
 MOST_INPUTS = 16
 MOST_STEPS = 64
@@ -295,30 +295,3 @@ def _tensors_of(layer: nn.Linear) -> tuple[th.Tensor | None, ...]:
 
 def _readable(tensor: th.Tensor) -> bool:
     return tensor.dtype == th.float32 and tensor.is_cpu and tensor.is_contiguous()
-
-
-class KeptInference:
-    """An inference that is made anew when modules have changed. Copies and pickles begin empty."""
-
-    def __init__(self) -> None:
-        self._watch: Watch | None = None
-        self._inference: Inference | None = None
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> KeptInference:
-        return KeptInference()
-
-    def __reduce__(self) -> Any:
-        return KeptInference, ()
-
-    def get(self, find: Callable[[], tuple[Paths, list[nn.Module]]]) -> Inference | None:
-        """The inference; None where the modules must be called one by one.
-
-        :param find: the paths, and the modules around them from the outermost, whose hooks are run
-            anyhow, to those that the inference passes over
-        """
-        if self._watch is None or not self._watch.unchanged():
-            paths, around = find()
-            watch = Watch([*around, *modules_of(paths)])
-            self._inference = Inference.of(paths, around[1:])
-            self._watch = watch  # last: another thread may be looking
-        return self._inference

@@ -11,7 +11,8 @@ from torch.nn.modules.module import _has_any_global_hook
 
 from sb3_sparse.engine.activations import ACTIVATIONS, ADJUSTABLE, tells_its_slope
 from sb3_sparse.engine.chains import Chain, watched
-from sb3_sparse.engine.inference import KeptInference, by_modules
+from sb3_sparse.engine.inference import by_modules
+from sb3_sparse.engine.kept import KeptInference
 from sb3_sparse.engine.linear import CompactLinear
 
 ELEMENTWISE = (*ACTIVATIONS, nn.Identity)
