@@ -191,7 +191,8 @@ class Inference:
         :param doubles: whether they are float64, not float32
         :param x: where they lie, or they themselves
         """
-        binding = None if self.watched else self._bound()
+        on_cpu = self._tensors[0].is_cpu
+        binding = self._bound() if on_cpu and not self.watched else None
         if binding is None:
             return None
         room = Room(n * self._total)

@@ -82,9 +82,12 @@ class SparseActorCriticPolicy(SparsePolicyMixin, ActorCriticPolicy):
         results = self._results("actor", obs, "pi_features_extractor")
         if results is None:
             return super().get_distribution(obs)
+        return self._distribution(results[0])
+
+    def _distribution(self, result: th.Tensor) -> Distribution:
         if isinstance(self.action_dist, DiagGaussianDistribution):
-            return self.action_dist.proba_distribution(results[0], self.log_std)
-        return self.action_dist.proba_distribution(action_logits=results[0])
+            return self.action_dist.proba_distribution(result, self.log_std)
+        return self.action_dist.proba_distribution(action_logits=result)
 
     def predict_values(self, obs: Any) -> th.Tensor:
         """As in SB3, shape ``(n, 1)``."""
@@ -106,7 +109,9 @@ class SparseActorCriticPolicy(SparsePolicyMixin, ActorCriticPolicy):
             return self.action_dist.act(result, self.log_std, deterministic)
         if isinstance(self.action_dist, QuickCategorical):
             return self.action_dist.act(result, deterministic)
-        return None
+        distribution = self._distribution(result)
+        actions = distribution.get_actions(deterministic)
+        return actions, distribution.log_prob(actions)
 
     def __getattr__(self, name: str) -> Any:
         try:
