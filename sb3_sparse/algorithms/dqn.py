@@ -51,8 +51,7 @@ class DQN(OffPolicy, stable_baselines3.DQN):
         source = self._find_source()
         losses = []
         for _ in range(gradient_steps):
-            machine = self._machine(batch_size, source)
-            self._next_batch(machine, source, batch_size)
+            machine, _ = self._next_batch(batch_size, source)
             machine.set({"max_grad_norm": self.max_grad_norm})
             machine.run()
             losses.append(machine.number("loss"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -35,7 +36,8 @@ class Transitions(NamedTuple):
 class OffPolicy(Fused, OffPolicyAlgorithm):
     """An algorithm that learns from a replay buffer."""
 
-    _source: str
+    _machine: Callable[..., Machine]
+    """What runs the next gradient step, by batch size, source and details of the algorithm."""
 
     def _find_source(self) -> str:
         """How to read the replay buffer."""
@@ -72,28 +74,34 @@ class OffPolicy(Fused, OffPolicyAlgorithm):
             program.input("discounts", 1) if source == N_STEP else program.scalar("gamma"),
         )
 
-    def _next_batch(self, machine: Machine, source: str, batch: int) -> Any:
-        """Hand over a batch, of the same random numbers as SB3.
+    def _next_batch(self, batch: int, source: str, *details: Any) -> tuple[Machine, Any]:
+        """Draw a batch, of the same random numbers as SB3, and hand it over.
 
-        :return: what the buffer's ``sample`` gave; None if it was not asked
+        :param details: what else the program depends on, as ``_machine`` takes it
+        :return: the machine that has it, and what the buffer's ``sample`` gave; None if it was not
+            asked
         """
-        machine.set({"gamma": self.gamma})
+        machine = self._machine(batch, source, *details)  # before anything is drawn
         buffer: Any = self.replay_buffer
+        data = None
         if source == IN_PLACE:
             self._point(machine, buffer, batch)
-            return None
-        data = buffer.sample(batch, env=self._vec_normalize_env)
-        rows = {
-            "obs": features(self.policy, data.observations),
-            "next_obs": features(self.policy, data.next_observations),
-            "actions": data.actions,
-            "rewards": data.rewards,
-            "dones": data.dones,
-        }
-        if data.discounts is not None:
-            rows["discounts"] = data.discounts
-        machine.load(rows)
-        return data
+        else:
+            data = buffer.sample(batch, env=self._vec_normalize_env)
+            source = SAMPLED if data.discounts is None else N_STEP
+            machine = self._machine(len(data.rewards), source, *details)
+            rows = {
+                "obs": features(self.policy, data.observations),
+                "next_obs": features(self.policy, data.next_observations),
+                "actions": data.actions,
+                "rewards": data.rewards,
+                "dones": data.dones,
+            }
+            if source == N_STEP:
+                rows["discounts"] = data.discounts
+            machine.load(rows)
+        machine.set({"gamma": self.gamma})
+        return machine, data
 
     def _observations(self, machine: Machine, data: Any, next_ones: bool) -> th.Tensor:
         """Those of the batch at hand, as SB3's buffer gives them.

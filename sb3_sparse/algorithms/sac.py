@@ -107,11 +107,10 @@ class SAC(OffPolicy, stable_baselines3.SAC):
         if self.tau >= 1:
             raise NotCovered("targets that are copies")
         source = self._find_source()
-        shape = (batch_size, *(self.action_space.shape or ()))
         logged: dict[str, list[float]] = {}
         for step in range(gradient_steps):
-            machine = self._machine(batch_size, source)
-            data = self._next_batch(machine, source, batch_size)
+            machine, data = self._next_batch(batch_size, source)
+            shape = (machine.batch, *(self.action_space.shape or ()))
             machine.inputs.load({"noise": th.randn(shape), "next_noise": th.randn(shape)})
             machine.set({"target_entropy": float(self.target_entropy)})
             if self.ent_coef_optimizer is None:

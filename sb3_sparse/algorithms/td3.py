@@ -75,13 +75,12 @@ class TD3(OffPolicy, stable_baselines3.TD3):
         if self.tau >= 1:
             raise NotCovered("targets that are copies")
         source = self._find_source()
-        shape = (batch_size, *(self.action_space.shape or ()))
         actor_losses, critic_losses = [], []
         for _ in range(gradient_steps):
             delayed = (self._n_updates + 1) % self.policy_delay == 0
-            machine = self._machine(batch_size, source, delayed)
+            machine, _ = self._next_batch(batch_size, source, delayed)
             self._n_updates += 1
-            self._next_batch(machine, source, batch_size)
+            shape = (machine.batch, *(self.action_space.shape or ()))
             noise = th.empty(shape).normal_(0, self.target_policy_noise)
             noise = noise.clamp_(-self.target_noise_clip, self.target_noise_clip)
             machine.inputs.load({"noise": noise})

@@ -80,14 +80,10 @@ class Chain:
 
 
 def watched(x: th.Tensor) -> bool:
-    """Whether somebody wants to see single operations on ``x``, e.g. by fake tensors."""
-    return type(x) not in PLAIN or watching()
-
-
-def watching() -> bool:
-    """Whether somebody wants to see single operations: tracing, dispatch modes, torch.func."""
+    """Whether somebody wants to see single operations: tracing, fake tensors, torch.func."""
     return (
-        th._C._get_tracing_state() is not None
+        type(x) not in PLAIN
+        or th._C._get_tracing_state() is not None
         or th._C._len_torch_dispatch_stack() > 0
         or th._C._functorch.peek_interpreter_stack() is not None
         or forward_ad._current_level >= 0

@@ -56,6 +56,8 @@ class Inputs:
                 tensor, kind = tensor.float(), "float32"
             if not tensor.is_contiguous():
                 tensor = tensor.contiguous()
+            if batch not in (0, len(tensor)):
+                raise NotCovered("parts of a batch that have not the same size")
             batch = len(tensor)
             self._put(name, tensor.data_ptr(), kind, tensor.numel() // max(1, batch), 0)
             self._held[name] = tensor
