@@ -80,10 +80,14 @@ class Chain:
 
 
 def watched(x: th.Tensor) -> bool:
-    """Whether somebody wants to see single operations: tracing, fake tensors, torch.func."""
+    """Whether somebody wants to see single operations on ``x``, e.g. by fake tensors."""
+    return type(x) not in PLAIN or watching()
+
+
+def watching() -> bool:
+    """Whether somebody wants to see single operations: tracing, dispatch modes, torch.func."""
     return (
-        type(x) not in PLAIN
-        or th._C._get_tracing_state() is not None
+        th._C._get_tracing_state() is not None
         or th._C._len_torch_dispatch_stack() > 0
         or th._C._functorch.peek_interpreter_stack() is not None
         or forward_ad._current_level >= 0

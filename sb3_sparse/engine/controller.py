@@ -64,7 +64,8 @@ class Controller:
         """Whether targets follow a mask at once; as long as nobody says so, they need not."""
         self._gradient_masks: dict[str, GradientMask] = {}
         self._gradient_hooks, self._optimizer_hooks = Hooks(), Hooks()
-        self._warned = False
+        self._dense = not any(network.sparse_layers for network in networks)  # and it stays so
+        self._warned = self._dense
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "plan": None, "_in_force": bool, "_gradient_masks": {}}
@@ -219,8 +220,9 @@ class Controller:
         return network.wants_gradients(self.plan, self.progress)
 
     def _before_step(self, optimizer: th.optim.Optimizer, args: object, kwargs: object) -> None:
-        self._attach_to_gradients()  # a layer may have been frozen until now
-        self._settle_moments(optimizer)
+        if not self._dense:
+            self._attach_to_gradients()  # a layer may have been frozen until now
+            self._settle_moments(optimizer)
         for network in self._owned_by(optimizer):
             network.clock += 1
             if self.plan is None and not self._warned and network.denser:

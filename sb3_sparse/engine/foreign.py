@@ -43,6 +43,9 @@ class _Found(NamedTuple):
     parameters: int  # hash of their ids
     layers: list[ref[SparseLayer]]
 
+    def alive(self) -> Iterator[SparseLayer]:
+        return (layer for reference in self.layers if (layer := reference()) is not None)
+
 
 _owners: WeakSet[Any] = WeakSet()
 _found: WeakKeyDictionary[th.optim.Optimizer, _Found] = WeakKeyDictionary()
@@ -59,6 +62,8 @@ def watch(owner: Owner) -> None:
     Call again when its layers or optimizers are others.
     """
     global _changes
+    if all(layer.always_full for layer in owner.layers):
+        return  # there is nothing to look after
     if not _changes:
         register_optimizer_step_pre_hook(_before_step)
         register_optimizer_step_post_hook(_after_step)
@@ -81,13 +86,14 @@ def _before_step(optimizer: th.optim.Optimizer, args: object, kwargs: object) ->
 
 
 def _after_step(optimizer: th.optim.Optimizer, args: object, kwargs: object) -> None:
-    for layer in _layers_of(optimizer):
+    found = _found.get(optimizer)
+    for layer in () if found is None else found.alive():
         layer.remask()
 
 
 def _layers_of(optimizer: th.optim.Optimizer) -> Iterator[SparseLayer]:
-    moved = {id(p) for group in optimizer.param_groups for p in group["params"]}
-    parameters = hash(frozenset(moved))
+    moved = tuple([id(p) for group in optimizer.param_groups for p in group["params"]])
+    parameters = hash(moved)
     found = _found.get(optimizer)
     if found is None or found.changes != _changes or found.parameters != parameters:
         layers = [
@@ -98,7 +104,7 @@ def _layers_of(optimizer: th.optim.Optimizer) -> Iterator[SparseLayer]:
             if id(layer.module._parameters.get("weight")) in moved  # may be parametrized by now
         ]
         found = _found[optimizer] = _Found(_changes, parameters, layers)
-    return (layer for reference in found.layers if (layer := reference()) is not None)
+    return found.alive()
 
 
 class Guard:

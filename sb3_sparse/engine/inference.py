@@ -10,28 +10,40 @@ from __future__ import annotations
 
 import ctypes
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from itertools import chain
-from operator import itemgetter
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch as th
+from numpy.typing import NDArray
 from torch import nn
+from torch.compiler import is_compiling
 from torch.nn.modules.module import _has_any_global_hook
 
 from sb3_sparse.engine.activations import ADJUSTABLE, number_of
-from sb3_sparse.engine.chains import watched
+from sb3_sparse.engine.chains import watched, watching
 from sb3_sparse.engine.linear import TRIES, CompactLinear
 from sb3_sparse.engine.masked import FLOAT_MASK_KEY, MaskedLayer
 from sb3_sparse.engine.native.library import bits_of, library, why_missing
 from sb3_sparse.engine.paths import Paths, modules_of, parts_of
+from sb3_sparse.engine.room import Room
 from sb3_sparse.engine.structure import Structure
-from sb3_sparse.engine.watch import Watch, patched
+from sb3_sparse.engine.watch import patched
 
 MOST_INPUTS = 16
 MOST_STEPS = 64
 """``LANES`` and ``MOST_STEPS`` of ``kernels.h``."""
-HOOKS = itemgetter("_forward_hooks", "_forward_pre_hooks")
+DOUBLES: dict[Any, bool] = {
+    **{th.float32: False, th.float64: True},
+    **{np.dtype(np.float32): False, np.dtype(np.float64): True},
+}
+"""Types of observations that the kernels read, and whether these are twice as wide as theirs."""
+
+
+def by_modules(x: th.Tensor) -> bool:
+    """Whether networks must act module by module: for those who watch, or to be compiled."""
+    return is_compiling() or watched(x)
 
 
 class Step(NamedTuple):
@@ -76,7 +88,8 @@ class Inference:
         self._activations = [step.activation for step in steps if step.activation is not None]
         self._adjustable = [m for m in self._activations if isinstance(m, ADJUSTABLE)]
         self._targets = [layer for layer in self._compact if layer.is_target]
-        self._hooked = list(map(vars, modules))
+        hooks = ((vars(m)["_forward_hooks"], vars(m)["_forward_pre_hooks"]) for m in modules)
+        self._hooks = list(chain.from_iterable(hooks))
         self._tensors: list[th.Tensor] = [
             tensor for layer in self._layers for tensor in _tensors_of(layer) if tensor is not None
         ]
@@ -122,17 +135,10 @@ class Inference:
         return cls(steps, ends, modules)
 
     @property
-    def on_cpu(self) -> bool:
-        """Whether its tensors are where the kernels can read them."""
-        return self._tensors[0].is_cpu
-
-    @property
     def watched(self) -> bool:
         """Whether somebody wants to see the modules called, or in another precision."""
         return (
-            any(chain.from_iterable(map(HOOKS, self._hooked)))
-            or th.is_autocast_enabled("cpu")
-            or bool(_has_any_global_hook())  # type: ignore[no-untyped-call]
+            any(self._hooks) or th.is_autocast_enabled("cpu") or bool(_has_any_global_hook())  # type: ignore[no-untyped-call]
         )
 
     def __call__(self, x: th.Tensor) -> list[th.Tensor] | None:
@@ -144,34 +150,61 @@ class Inference:
 
         :param x: shape ``(n, features)``
         """
-        if watched(x) or not 0 < x.shape[0] <= MOST_INPUTS:
+        if by_modules(x) or not 0 < x.shape[0] <= MOST_INPUTS:
             return None
-        results = self._results(x)
-        if results is None:
-            # Let the modules compute what the kernels would: without what is inactive.
-            for layer in self._layers:
-                for masked in MaskedLayer.below(layer):
-                    masked.remask()
-        return results
+        if x.dim() != 2 or x.dtype is not th.float32:
+            return self._leave()
+        return self.of_observations(x)
 
-    def _results(self, x: th.Tensor) -> list[th.Tensor] | None:
-        n, *features = x.shape
-        if features != [self._columns] or x.dtype is not th.float32 or not x.is_cpu or self.watched:
-            return None
-        binding = self._bound()
-        if binding is None:
-            return None
+    def _leave(self) -> list[th.Tensor] | None:
+        """Let the modules compute what the kernels would: without what is inactive."""
+        for layer in self._layers:
+            for masked in MaskedLayer.below(layer):
+                masked.remask()
+        return None
+
+    def of_observations(self, x: th.Tensor) -> list[th.Tensor] | None:
+        """The same for 1 to 16 observations, which may be float64 and of several dimensions.
+
+        :param x: shape ``(n, *shape of an observation)``; they must not go :func:`by_modules`
+        """
+        n, doubles = len(x), DOUBLES.get(x.dtype)
+        if doubles is None or not x.is_cpu or x.numel() != n * self._columns:
+            return self._leave()
         if not x.is_contiguous() or x.is_neg():
             x = x.contiguous().resolve_neg()
-        y = th.empty(n * self._total, dtype=th.float32, device="cpu")
-        if self._call(binding.arguments, len(self._steps), n, x.data_ptr(), y.data_ptr()):
+        room = self._compute(n, doubles, x.data_ptr())
+        return self._leave() if room is None else [room.tensor(*at) for at in self._split(n)]
+
+    def of_array(self, x: NDArray[Any]) -> list[NDArray[np.float32]] | None:
+        """The same for observations in an array, of any type and number, as arrays."""
+        n, doubles = x.shape[0], DOUBLES.get(x.dtype)
+        if doubles is None or not 0 < n <= MOST_INPUTS or x.size != n * self._columns or watching():
             return None
-        if len(self._widths) == 1:
-            return [y.view(n, self._total)]
-        return [
-            y.as_strided((n, width), (width, 1), n * place)
-            for width, place in zip(self._widths, self._places, strict=True)
-        ]
+        room = self._compute(n, doubles, x.tobytes())
+        return None if room is None else [room.array(*at) for at in self._split(n)]
+
+    def _compute(self, n: int, doubles: bool, x: int | bytes) -> Room | None:
+        """The networks' results, one after the other.
+
+        :param n: number of inputs
+        :param doubles: whether they are float64, not float32
+        :param x: where they lie, or they themselves
+        """
+        on_cpu = self._tensors[0].is_cpu
+        binding = self._bound() if on_cpu and not self.watched else None
+        if binding is None:
+            return None
+        room = Room(n * self._total)
+        steps = len(self._steps)
+        failed = self._call(binding.arguments, steps, n, doubles, x, room.memory)
+        return None if failed else room
+
+    def _split(self, n: int) -> Iterator[tuple[tuple[int, int], int]]:
+        """Shape of each network's results, and where they begin among all."""
+        return (
+            ((n, width), n * place) for width, place in zip(self._widths, self._places, strict=True)
+        )
 
     def _bound(self) -> Binding | None:
         """Where the tensors lie now; None if the kernels cannot read one."""
@@ -263,35 +296,3 @@ def _tensors_of(layer: nn.Linear) -> tuple[th.Tensor | None, ...]:
 
 def _readable(tensor: th.Tensor) -> bool:
     return tensor.dtype == th.float32 and tensor.is_cpu and tensor.is_contiguous()
-
-
-class KeptInference:
-    """An inference that is made anew when modules have changed. Copies and pickles begin empty."""
-
-    def __init__(self) -> None:
-        self._watch: Watch | None = None
-        self._inference: Inference | None = None
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> KeptInference:
-        return KeptInference()
-
-    def __reduce__(self) -> Any:
-        return KeptInference, ()
-
-    @property
-    def found(self) -> bool:
-        """Whether there was one at the last call, with its tensors on the CPU."""
-        return self._inference is not None and self._inference.on_cpu
-
-    def get(self, find: Callable[[], tuple[Paths, list[nn.Module]]]) -> Inference | None:
-        """The inference; None where the modules must be called one by one.
-
-        :param find: the paths, and the modules around them from the outermost, whose hooks are run
-            anyhow, to those that the inference passes over
-        """
-        if self._watch is None or not self._watch.unchanged():
-            paths, around = find()
-            watch = Watch([*around, *modules_of(paths)])
-            self._inference = Inference.of(paths, around[1:])
-            self._watch = watch  # last: another thread may be looking
-        return self._inference

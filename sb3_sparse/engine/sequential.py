@@ -11,7 +11,8 @@ from torch.nn.modules.module import _has_any_global_hook
 
 from sb3_sparse.engine.activations import ACTIVATIONS, ADJUSTABLE, tells_its_slope
 from sb3_sparse.engine.chains import Chain, watched
-from sb3_sparse.engine.inference import KeptInference
+from sb3_sparse.engine.inference import by_modules
+from sb3_sparse.engine.kept import KeptInference
 from sb3_sparse.engine.linear import CompactLinear
 
 ELEMENTWISE = (*ACTIVATIONS, nn.Identity)
@@ -37,8 +38,10 @@ class ChainedSequential(nn.Sequential):
 
     def forward(self, input: th.Tensor) -> th.Tensor:
         """As of ``Sequential``."""
-        if not th.is_grad_enabled() and (results := self._inferred(input)) is not None:
-            return results[0]
+        if not th.is_grad_enabled() and not by_modules(input):
+            results = self._inferred(input)
+            if results is not None:
+                return results[0]
         modules = tuple(self._modules.values())
         hooked = any(getattr(module, hooks) for module in modules for hooks in HOOKS)
         hooked = hooked or any("forward" in vars(module) for module in modules)

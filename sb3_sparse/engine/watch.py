@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from itertools import chain
+from operator import is_
 from typing import Any
 
 from torch import nn
@@ -31,13 +32,11 @@ class Watch:
         named = [held[kind] for held in attributes for kind in kinds]
         self._named = [names for names in named if names]
         self._seen: list[Any] = list(chain.from_iterable(map(dict.values, self._named)))
-        self._ids = list(map(id, self._seen))
-        self._sized = attributes + [names for names in named if not names]
+        self._sized = attributes + named
         self._sizes = list(map(len, self._sized))
 
     def unchanged(self) -> bool:
         """Whether all of it is as it was."""
-        return (
-            list(map(id, chain.from_iterable(map(dict.values, self._named)))) == self._ids
-            and list(map(len, self._sized)) == self._sizes
+        return list(map(len, self._sized)) == self._sizes and all(
+            map(is_, chain.from_iterable(map(dict.values, self._named)), self._seen)
         )

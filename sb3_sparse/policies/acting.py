@@ -6,14 +6,14 @@ from abc import abstractmethod
 from typing import Any
 
 import numpy as np
-import torch as th
 from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.policies import BasePolicy
 
-from sb3_sparse.engine.inference import MOST_INPUTS
+from sb3_sparse.engine.boxes import CLIP, SCALE, UNSCALE, Bounds
+from sb3_sparse.engine.native.library import why_missing
 from sb3_sparse.policies.modes import SwitchesModes
-from sb3_sparse.policies.shortcut import takes_vectors, untouched
+from sb3_sparse.policies.shortcut import untouched
 
 Actions = NDArray[Any]
 ON_THE_WAY = (
@@ -31,9 +31,7 @@ ON_THE_WAY = (
 class Acts(SwitchesModes, BasePolicy):
     """A policy or part of one that predicts."""
 
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-        self._takes_vectors = takes_vectors(self)
+    _bounds: Bounds | None = None
 
     def predict(
         self,
@@ -45,53 +43,54 @@ class Acts(SwitchesModes, BasePolicy):
         """As in SB3."""
         actions = self._predicted(observation, deterministic)
         if actions is None:
-            self._enforce()
             return super().predict(observation, state, episode_start, deterministic)
         return actions, state
 
     def _predicted(self, observation: Any, deterministic: bool) -> Actions | None:
-        """Actions for vectors of numbers; None for anything else, about which SB3 knows more."""
-        if (
-            type(observation) is not np.ndarray
-            or not self._takes_vectors
-            or not untouched(self, ON_THE_WAY)
-        ):
+        """Actions by the kernels; None where SB3 must say."""
+        if type(observation) is not np.ndarray or not untouched(self, ON_THE_WAY):
             return None
-        shape, acts = self.observation_space.shape or (), self.action_space.shape or ()
-        alone = observation.shape == shape
-        if not alone and observation.shape[1:] != shape:
+        alone = observation.shape == self.observation_space.shape
+        if not alone and observation.shape[1:] != self.observation_space.shape:
             return None
-        obs = th.from_numpy(np.array(observation).reshape((-1, *shape)))
-        if not self._prepare_to_act(len(obs)):
-            obs = obs.to(self.device)
-        with th.no_grad():
-            acted = self._predict(obs, deterministic)
-        actions: Actions = acted.cpu().numpy().reshape((-1, *acts))
-        if isinstance(self.action_space, spaces.Box):
+        acted = self._choose(observation[None] if alone else observation, deterministic)
+        if acted is None:
+            return None
+        self._evaluate()
+        actions, space = acted, self.action_space
+        if isinstance(space, spaces.Box):
+            actions = acted.reshape((-1, *space.shape))
             if self.squash_output:
                 actions = self.unscale_action(actions)
             else:
-                actions = np.clip(actions, self.action_space.low, self.action_space.high)
+                clipped = self._in_box(actions, CLIP)
+                actions = actions.clip(space.low, space.high) if clipped is None else clipped
         return actions.squeeze(axis=0) if alone else actions
 
-    def _prepare_to_act(self, count: int) -> bool:
-        """Be in evaluation mode; whether the kernels will act.
+    def scale_action(self, action: Actions) -> Actions:
+        """As in SB3."""
+        scaled = self._in_box(action, SCALE)
+        return super().scale_action(action) if scaled is None else scaled
 
-        If not, inactive weights are set to 0, since modules will read them.
+    def unscale_action(self, scaled_action: Actions) -> Actions:
+        """As in SB3."""
+        unscaled = self._in_box(scaled_action, UNSCALE)
+        return super().unscale_action(scaled_action) if unscaled is None else unscaled
 
-        :param count: number of observations
+    def _in_box(self, actions: Actions, how: int) -> Actions | None:
+        """What :meth:`Bounds.of` gives; None where NumPy must say."""
+        space, bounds = self.action_space, self._bounds
+        if not isinstance(space, spaces.Box) or type(actions) is not np.ndarray:
+            return None
+        if bounds is None or bounds.low is not space.low or bounds.high is not space.high:
+            if why_missing() is not None or not Bounds.readable(space.low, space.high):
+                return None
+            bounds = self._bounds = Bounds(space.low, space.high)
+        return bounds.of(actions, how)
+
+    @abstractmethod
+    def _choose(self, observations: Actions, deterministic: bool) -> Actions | None:
+        """Actions as the networks give them, by the kernels; None where modules must be called.
+
+        :param observations: shape ``(n, *shape of an observation)``, of any type
         """
-        self._switch(False)
-        if self.by_kernels and count <= MOST_INPUTS:
-            return True
-        self._enforce()
-        return False
-
-    @property
-    @abstractmethod
-    def by_kernels(self) -> bool:
-        """Whether the kernels acted the last time."""
-
-    @abstractmethod
-    def _enforce(self) -> None:
-        """Set inactive weights to 0 that somebody has written."""

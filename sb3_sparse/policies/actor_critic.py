@@ -12,6 +12,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, NatureCNN
 
 from sb3_sparse.errors import UnsupportedError
+from sb3_sparse.policies.acting import Actions
 from sb3_sparse.policies.extractors import with_extractor
 from sb3_sparse.policies.mixin import SparsePolicyMixin
 from sb3_sparse.policies.sampling import QuickCategorical, QuickGaussian, quick
@@ -53,13 +54,7 @@ class SparseActorCriticPolicy(SparsePolicyMixin, ActorCriticPolicy):
         if self.share_features_extractor:
             self._shortcuts["both"] = Shortcut((ACTOR, CRITIC), acts)
 
-    @property
-    def by_kernels(self) -> bool:
-        """Whether the kernels acted the last time."""
-        shortcut = self._shortcuts.get("actor")
-        return shortcut is not None and shortcut.found
-
-    def _results(self, networks: str, obs: Any, extractor: Any) -> list[th.Tensor] | None:
+    def _results(self, networks: str, obs: Any, extractor: str) -> list[th.Tensor] | None:
         shortcut = self._shortcuts.get(networks)
         return None if shortcut is None else shortcut.results(self, obs, extractor)
 
@@ -77,31 +72,36 @@ class SparseActorCriticPolicy(SparsePolicyMixin, ActorCriticPolicy):
     def _actor_and_critic(self, obs: Any) -> list[th.Tensor] | None:
         """What the actor's head and the critic give; None where modules must be called."""
         if self.share_features_extractor:
-            return self._results("both", obs, self.features_extractor)
-        mean = self._results("actor", obs, self.pi_features_extractor)
-        values = None if mean is None else self._results("critic", obs, self.vf_features_extractor)
+            return self._results("both", obs, "features_extractor")
+        mean = self._results("actor", obs, "pi_features_extractor")
+        values = None if mean is None else self._results("critic", obs, "vf_features_extractor")
         return None if mean is None or values is None else mean + values
 
     def get_distribution(self, obs: Any) -> Distribution:
         """As in SB3."""
-        results = self._results("actor", obs, self.pi_features_extractor)
+        results = self._results("actor", obs, "pi_features_extractor")
         if results is None:
             return super().get_distribution(obs)
+        return self._distribution(results[0])
+
+    def _distribution(self, result: th.Tensor) -> Distribution:
         if isinstance(self.action_dist, DiagGaussianDistribution):
-            return self.action_dist.proba_distribution(results[0], self.log_std)
-        return self.action_dist.proba_distribution(action_logits=results[0])
+            return self.action_dist.proba_distribution(result, self.log_std)
+        return self.action_dist.proba_distribution(action_logits=result)
 
     def predict_values(self, obs: Any) -> th.Tensor:
         """As in SB3, shape ``(n, 1)``."""
-        results = self._results("critic", obs, self.vf_features_extractor)
+        results = self._results("critic", obs, "vf_features_extractor")
         return super().predict_values(obs) if results is None else results[0]
 
-    def _predict(self, observation: Any, deterministic: bool = False) -> th.Tensor:
-        results = None
-        if untouched(self, ("get_distribution",)):
-            results = self._results("actor", observation, self.pi_features_extractor)
-        acted = None if results is None else self._act(results[0], deterministic)
-        return super()._predict(observation, deterministic) if acted is None else acted[0]
+    def _choose(self, observations: Actions, deterministic: bool) -> Actions | None:
+        if not self._shortcuts or not untouched(self, ("get_distribution",)):
+            return None
+        results = self._shortcuts["actor"].of_array(self, observations)
+        if results is None:
+            return None
+        acted = self._act(th.from_numpy(results[0]), deterministic)
+        return None if acted is None else acted[0].numpy()
 
     def _act(self, result: th.Tensor, deterministic: bool) -> tuple[th.Tensor, th.Tensor] | None:
         """Actions and log probabilities of what the actor's head gives."""
@@ -109,9 +109,15 @@ class SparseActorCriticPolicy(SparsePolicyMixin, ActorCriticPolicy):
             return self.action_dist.act(result, self.log_std, deterministic)
         if isinstance(self.action_dist, QuickCategorical):
             return self.action_dist.act(result, deterministic)
-        return None
+        distribution = self._distribution(result)
+        actions = distribution.get_actions(deterministic)
+        return actions, distribution.log_prob(actions)
 
     def __getattr__(self, name: str) -> Any:
+        try:
+            return self.__dict__["_modules"][name]  # before torch looks in other places
+        except KeyError:
+            pass
         if name == "lstm_actor":  # what RecurrentPPO asks for first, before it checks the class
             raise NoSuchPart(
                 "RecurrentPPO has no sparse policy, since an LSTM cannot be masked; PPO, A2C and "

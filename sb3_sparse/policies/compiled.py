@@ -21,7 +21,7 @@ def unwrapped(policy: Policy) -> Policy:
 
     :param policy: compiled or not; parameters and hooks are the same in both
     """
-    found: Policy = getattr(policy, WRAPPED, policy)
+    found: Policy = getattr(policy, "_modules", {}).get(WRAPPED, policy)
     return found
 
 

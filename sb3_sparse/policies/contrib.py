@@ -11,11 +11,12 @@ from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtr
 from stable_baselines3.common.type_aliases import Schedule
 
 from sb3_sparse.errors import MissingExtra
+from sb3_sparse.policies.acting import Actions
 from sb3_sparse.policies.critics import PassesGradientsOn, SparseCriticsMixin
 from sb3_sparse.policies.extractors import with_extractor
 from sb3_sparse.policies.gaussian import GaussianActor
 from sb3_sparse.policies.mixin import SparsePolicyMixin
-from sb3_sparse.policies.parts import ActingPart
+from sb3_sparse.policies.parts import ActingPart, ActsByPart
 from sb3_sparse.policies.sac import GAUSSIAN_ACTOR, TWIN_CRITIC
 from sb3_sparse.policies.spec import NetworkSpec
 
@@ -61,14 +62,22 @@ class SparseQuantileNetwork(ActingPart, QuantileNetwork):
     def forward(self, obs: Any) -> th.Tensor:
         """As in sb3-contrib, shape ``(n, quantiles, actions)``."""
         results = self.results(obs)
-        if results is None:
-            return super().forward(obs)
-        return results[0].view(-1, self.n_quantiles, int(self.action_space.n))
+        return super().forward(obs) if results is None else self._quantiles(results[0])
+
+    def _quantiles(self, result: th.Tensor) -> th.Tensor:
+        return result.view(-1, self.n_quantiles, int(self.action_space.n))
+
+    def decide(self, results: list[Actions], deterministic: bool) -> Actions:
+        """The actions that are best in the mean, shape ``(n,)``."""
+        values = self._quantiles(th.from_numpy(results[0])).mean(dim=1)
+        best: Actions = values.argmax(dim=1).numpy()
+        return best
 
 
-class SparseQRDQNPolicy(SparsePolicyMixin, QRDQNPolicy):
+class SparseQRDQNPolicy(ActsByPart, SparsePolicyMixin, QRDQNPolicy):
     """Sparse quantile network for QR-DQN."""
 
+    acting = "quantile_net"
     quantile_net: SparseQuantileNetwork
     networks = {
         "quantile_net": NetworkSpec(
@@ -83,14 +92,6 @@ class SparseQRDQNPolicy(SparsePolicyMixin, QRDQNPolicy):
         """As in sb3-contrib, of our class."""
         kwargs = self._update_features_extractor(self.net_args, features_extractor=None)
         return SparseQuantileNetwork(**kwargs).to(self.device)
-
-    @property
-    def by_kernels(self) -> bool:
-        """Whether the kernels acted the last time."""
-        return self.quantile_net.by_kernels
-
-    def _quicken(self) -> None:
-        self.quantile_net.quicken()
 
 
 SparseQRDQNMlpPolicy = with_extractor(SparseQRDQNPolicy, "Mlp", FlattenExtractor)

@@ -11,9 +11,8 @@ from stable_baselines3.common.policies import ContinuousCritic
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
-from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.policies.mixin import SparsePolicyMixin
-from sb3_sparse.policies.parts import ActingPart, SparsePart
+from sb3_sparse.policies.parts import ActingPart, ActsByPart, SparsePart
 
 
 @contextmanager
@@ -52,9 +51,10 @@ class SparseContinuousCritic(PassesGradientsOn, ContinuousCritic):
             return super().q1_forward(obs, actions)
 
 
-class SparseCriticsMixin(SparsePolicyMixin):
+class SparseCriticsMixin(ActsByPart, SparsePolicyMixin):
     """What the policies of SAC, TD3, DDPG, TQC and CrossQ have in common."""
 
+    acting = "actor"
     actor_class: ClassVar[type[ActingPart]]
     critic_class: ClassVar[type[PassesGradientsOn]] = SparseContinuousCritic
     actor_kwargs: dict[str, Any]
@@ -69,16 +69,3 @@ class SparseCriticsMixin(SparsePolicyMixin):
         """As in SB3, of :attr:`critic_class`."""
         kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
         return self.critic_class(**kwargs).to(self.device)
-
-    @property
-    def by_kernels(self) -> bool:
-        """Whether the kernels acted the last time."""
-        return self._acting().by_kernels
-
-    def _quicken(self) -> None:
-        self._acting().quicken()
-
-    def _acting(self) -> ActingPart:
-        actor = unwrapped(self.get_submodule("actor"))
-        assert isinstance(actor, ActingPart)
-        return actor

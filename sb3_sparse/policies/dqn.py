@@ -8,9 +8,10 @@ import torch as th
 from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, NatureCNN
 from stable_baselines3.dqn.policies import DQNPolicy, QNetwork
 
+from sb3_sparse.policies.acting import Actions
 from sb3_sparse.policies.extractors import with_extractor
 from sb3_sparse.policies.mixin import SparsePolicyMixin
-from sb3_sparse.policies.parts import ActingPart
+from sb3_sparse.policies.parts import ActingPart, ActsByPart
 from sb3_sparse.policies.spec import NetworkSpec
 
 
@@ -24,10 +25,16 @@ class SparseQNetwork(ActingPart, QNetwork):
         results = self.results(obs)
         return super().forward(obs) if results is None else results[0]
 
+    def decide(self, results: list[Actions], deterministic: bool) -> Actions:
+        """The best actions, shape ``(n,)``."""
+        best: Actions = results[0].argmax(axis=1)
+        return best
 
-class SparseDQNPolicy(SparsePolicyMixin, DQNPolicy):
+
+class SparseDQNPolicy(ActsByPart, SparsePolicyMixin, DQNPolicy):
     """Sparse Q network for DQN."""
 
+    acting = "q_net"
     q_net: SparseQNetwork
     networks = {
         "q_net": NetworkSpec(
@@ -42,14 +49,6 @@ class SparseDQNPolicy(SparsePolicyMixin, DQNPolicy):
         """As in SB3, of our class."""
         kwargs = self._update_features_extractor(self.net_args, features_extractor=None)
         return SparseQNetwork(**kwargs).to(self.device)
-
-    @property
-    def by_kernels(self) -> bool:
-        """Whether the kernels acted the last time."""
-        return self.q_net.by_kernels
-
-    def _quicken(self) -> None:
-        self.q_net.quicken()
 
 
 SparseDQNMlpPolicy = with_extractor(SparseDQNPolicy, "Mlp", FlattenExtractor)

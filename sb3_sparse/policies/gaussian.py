@@ -16,6 +16,7 @@ from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN
 from torch.autograd.function import once_differentiable
 
 from sb3_sparse.engine.gaussian import squashed
+from sb3_sparse.policies.acting import Actions
 from sb3_sparse.policies.parts import ActingPart
 from sb3_sparse.policies.sampling import MadeLater
 
@@ -80,11 +81,11 @@ class QuickSquashedGaussian(MadeLater, SquashedDiagGaussianDistribution):
         noise = None
         if not deterministic:
             noise = th.randn(mean.shape, dtype=th.float32, device="cpu")
-        made = th.empty((2, *mean.shape), dtype=th.float32, device="cpu")
-        if squashed(mean, log_std, (LOG_STD_MIN, LOG_STD_MAX), noise, made):
+        acted = squashed(mean, log_std, (LOG_STD_MIN, LOG_STD_MAX), noise)
+        if acted is None:
             return None
         self.remember(mean, log_std)
-        self.gaussian_actions, actions = made.unbind()
+        self.gaussian_actions, actions = acted
         return actions
 
 
@@ -108,9 +109,19 @@ class GaussianActor(ActingPart):
     def forward(self, obs: Any, deterministic: bool = False) -> th.Tensor:
         """As in SB3: actions of shape ``(n, dim)``."""
         results = self.results(obs)
-        if results is not None and isinstance(self.action_dist, QuickSquashedGaussian):
-            actions = self.action_dist.act(results[0], results[1], deterministic)
-            if actions is not None:
-                return actions
+        actions = None if results is None else self._act(results, deterministic)
+        if actions is not None:
+            return actions
         found: th.Tensor = super().forward(obs, deterministic)
         return found
+
+    def decide(self, results: list[Actions], deterministic: bool) -> Actions | None:
+        """Squashed actions, shape ``(n, dim)``."""
+        actions = self._act(list(map(th.from_numpy, results)), deterministic)
+        return None if actions is None else actions.numpy()
+
+    def _act(self, results: list[th.Tensor], deterministic: bool) -> th.Tensor | None:
+        if not isinstance(self.action_dist, QuickSquashedGaussian):
+            return None
+        mean, log_std = results
+        return self.action_dist.act(mean, log_std, deterministic)

@@ -191,9 +191,6 @@ class SparsePolicyMixin(Acts):
         else:
             self.sparse.notice()  # before anybody acts with what others have written
 
-    def _enforce(self) -> None:
-        self.sparse.notice()
-
     def _switch(self, mode: bool) -> bool:
         same = super()._switch(mode)
         if not same:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from operator import itemgetter
 from typing import Any
 
 from stable_baselines3.common.policies import BaseModel
@@ -13,6 +14,7 @@ from sb3_sparse.policies.storage import KNOWN
 
 SetMode = Callable[[bool], None]
 SWITCHES = ("train", "set_training_mode")
+TRAINING = itemgetter("training")
 
 
 class Modes:
@@ -45,6 +47,11 @@ class Modes:
             return True
         self._learn(root, set_mode, mode)
         return False
+
+    @property
+    def off(self) -> bool:
+        """Whether what it last switched is in evaluation mode."""
+        return self._watch is not None and not any(map(TRAINING, self._switched))
 
     def _learn(self, root: nn.Module, set_mode: SetMode, mode: bool) -> None:
         self._watch = None
@@ -81,6 +88,11 @@ class SwitchesModes(BaseModel):
     def set_training_mode(self, mode: bool) -> None:
         """As in SB3."""
         self._switch(mode)
+
+    def _evaluate(self) -> None:
+        """Be in evaluation mode, for what calls none of the modules."""
+        if not self._modes.off:
+            self._switch(False)
 
     def _switch(self, mode: bool) -> bool:
         """Set the mode; whether all modules were the same as at the last switch.

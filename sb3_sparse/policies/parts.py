@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import copy
+from abc import abstractmethod
 from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
 from stable_baselines3.common.distributions import Distribution
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
 from sb3_sparse.engine.foreign import Guard
 from sb3_sparse.engine.masked import MaskedLayer
 from sb3_sparse.engine.plain import make_plain
-from sb3_sparse.policies.acting import Acts
+from sb3_sparse.policies.acting import Actions, Acts
+from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.policies.modes import SwitchesModes
 from sb3_sparse.policies.shortcut import Shortcut
 from sb3_sparse.policies.vectors import from_vector, to_vector
@@ -70,7 +71,6 @@ class ActingPart(SparsePart, Acts):
     """Each of its networks from the features on, by names of its modules."""
     on_the_way: ClassVar[tuple[str, ...]] = ()
     """What SB3's ``forward`` calls besides; one of the user's own gets SB3's."""
-    features_extractor: BaseFeaturesExtractor
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
@@ -80,20 +80,47 @@ class ActingPart(SparsePart, Acts):
         """Act by the kernels from now on, where they know how."""
         self._shortcut = Shortcut(self.paths, self.on_the_way)
 
-    @property
-    def by_kernels(self) -> bool:
-        """Whether the kernels acted the last time."""
-        return self._shortcut is not None and self._shortcut.found
-
     def results(self, obs: Any) -> list[th.Tensor] | None:
         """What each of :attr:`paths` gives; None where modules must be called one by one."""
         if self._shortcut is None:
             return None
-        return self._shortcut.results(self, obs, self.features_extractor)
+        return self._shortcut.results(self, obs)
 
-    def _enforce(self) -> None:
-        for layer in MaskedLayer.below(self):
-            layer.notice()
+    def set_training_mode(self, mode: bool) -> None:
+        """As in SB3."""
+        self._switch(mode)
+        if not mode:  # before anybody acts with what others have written
+            for layer in MaskedLayer.below(self):
+                layer.notice()
+
+    def _choose(self, observations: Actions, deterministic: bool) -> Actions | None:
+        if self._shortcut is None:
+            return None
+        results = self._shortcut.of_array(self, observations)
+        return None if results is None else self.decide(results, deterministic)
+
+    @abstractmethod
+    def decide(self, results: list[Actions], deterministic: bool) -> Actions | None:
+        """Actions as SB3's ``_predict`` gives them; None where SB3 must say.
+
+        :param results: what each of :attr:`paths` gives, shape ``(n, outputs)``
+        """
+
+
+class ActsByPart(Acts):
+    """A policy one part of which predicts."""
+
+    acting: ClassVar[str]
+    """Name of the part."""
+
+    def _quicken(self) -> None:
+        part = unwrapped(self.get_submodule(self.acting))
+        assert isinstance(part, ActingPart)
+        part.quicken()
+
+    def _choose(self, observations: Actions, deterministic: bool) -> Actions | None:
+        part = self._modules[self.acting]
+        return part._choose(observations, deterministic) if isinstance(part, ActingPart) else None
 
 
 def without_graphs(root: nn.Module) -> dict[int, Any]:

@@ -53,11 +53,10 @@ class QuickGaussian(MadeLater, DiagGaussianDistribution):
         ):
             return None  # somebody has set another one, and torch knows what to do with it
         noise = None if deterministic else th.randn((n, size), dtype=th.float32, device="cpu")
-        made = th.empty(n * size + n, dtype=th.float32, device="cpu")
-        if gaussian(mean, log_std, noise, made):
-            return None
-        self.remember(mean, log_std.detach())
-        return made.as_strided((n, size), (size, 1), 0), made.as_strided((n,), (1,), n * size)
+        acted = gaussian(mean, log_std, noise)
+        if acted is not None:
+            self.remember(mean, log_std.detach())
+        return acted
 
 
 class QuickCategorical(MadeLater, CategoricalDistribution):

@@ -5,18 +5,23 @@ from __future__ import annotations
 from functools import cache
 from typing import Any
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
+from numpy.typing import NDArray
 from stable_baselines3.common.policies import BaseModel
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
 from torch import nn
 
-from sb3_sparse.engine.chains import watched
-from sb3_sparse.engine.inference import MOST_INPUTS, Inference, KeptInference
+from sb3_sparse.engine.inference import MOST_INPUTS, Inference, by_modules
+from sb3_sparse.engine.kept import KeptInference
 from sb3_sparse.engine.masked import MaskedLayer
 from sb3_sparse.engine.paths import Paths
 from sb3_sparse.policies.storage import KNOWN
+
+PREDICTS = ("_predict", "forward")
+"""Methods of SB3's on the way from observations to actions."""
 
 
 class Shortcut:
@@ -33,7 +38,7 @@ class Shortcut:
         self._paths = paths
         self._on_the_way = ("extract_features", *on_the_way)
         self._flat = False
-        self._whole = False
+        self._direct = False
         self._kept = KeptInference()
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Shortcut:
@@ -45,11 +50,6 @@ class Shortcut:
     def inference(self, root: BaseModel) -> Inference | None:
         """What computes the networks at once; None where modules must be called one by one."""
         return self._kept.get(lambda: self._find(root))
-
-    @property
-    def found(self) -> bool:
-        """Whether the kernels knew all modules with masks the last time, and on the CPU."""
-        return self._kept.found and self._whole
 
     def _find(self, root: BaseModel) -> tuple[Paths, list[nn.Module]]:
         # Whoever counted on the kernels goes by the modules if they know them no more.
@@ -69,30 +69,44 @@ class Shortcut:
         around = list({id(module): module for module in (*around, *extractors)}.values())
         known = all(type(module).__module__.partition(".")[0] in KNOWN for module in around[1:])
         self._flat = takes_vectors(root) and all(map(_only_flattens, extractors))
-        self._whole = not any(any(MaskedLayer.below(extractor)) for extractor in extractors)
+        self._direct = self._flat and untouched(root, PREDICTS)
         if self._flat:
             around += [module for extractor in extractors for module in extractor.children()]
         return paths if known else [], around
 
     def results(
-        self, root: BaseModel, obs: Any, extractor: BaseFeaturesExtractor
+        self, root: BaseModel, obs: Any, extractor: str = "features_extractor"
     ) -> list[th.Tensor] | None:
         """Each network's result; None where modules must be called one by one.
 
         :param root: the policy or part
         :param obs: observations as SB3 hands them to ``forward``
-        :param extractor: the features extractor that the networks share
+        :param extractor: name of the features extractor that the networks share
         """
-        if th.is_grad_enabled() or watched(obs) or not 0 < obs.shape[0] <= MOST_INPUTS:
+        if th.is_grad_enabled() or by_modules(obs) or not 0 < obs.shape[0] <= MOST_INPUTS:
             return None
         inference = self.inference(root)
         if inference is None:
             return None
         if self._flat:
-            return inference(obs.float().flatten(1))
+            return inference.of_observations(obs)
         if inference.watched:
             return None  # before the extractor is called, which would be called twice
-        return inference(BaseModel.extract_features(root, obs, extractor))
+        features = BaseModel.extract_features(root, obs, getattr(root, extractor))
+        return inference(features)
+
+    def of_array(
+        self, root: BaseModel, observations: NDArray[Any]
+    ) -> list[NDArray[np.float32]] | None:
+        """Each network's result; None where modules must be called one by one.
+
+        :param root: the policy or part, whose ``_predict`` and ``forward`` are passed over too
+        :param observations: shape ``(n, *shape of an observation)``, of any type
+        """
+        inference = self.inference(root)
+        if inference is None or not self._direct or root._forward_hooks or root._forward_pre_hooks:
+            return None
+        return inference.of_array(observations)
 
 
 def takes_vectors(root: BaseModel) -> bool:

@@ -8,6 +8,7 @@ import torch as th
 from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, NatureCNN
 from stable_baselines3.td3.policies import Actor, TD3Policy
 
+from sb3_sparse.policies.acting import Actions
 from sb3_sparse.policies.critics import SparseCriticsMixin
 from sb3_sparse.policies.extractors import with_extractor
 from sb3_sparse.policies.parts import ActingPart
@@ -24,6 +25,10 @@ class SparseTD3Actor(ActingPart, Actor):
         """As in SB3, shape ``(n, dim)``."""
         results = self.results(obs)
         return super().forward(obs) if results is None else results[0]
+
+    def decide(self, results: list[Actions], deterministic: bool) -> Actions:
+        """What the network gives, shape ``(n, dim)``."""
+        return results[0]
 
 
 class SparseTD3Policy(SparseCriticsMixin, TD3Policy):

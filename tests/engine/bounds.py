@@ -80,10 +80,12 @@ def one_act(lib, random, widths: list[int], batch: int, broken: bool):
         steps += [int(random.integers(15)), 0, 0, source, total if head else -1]
         total += rows if head else 0
     packed = (ctypes.c_int64 * len(steps))(*steps)
-    x, y = buffer(batch, widths[0]), buffer(batch, total)
+    doubles = int(random.integers(2))
+    x, y = buffer(batch, widths[0] * (1 + doubles)), buffer(batch, total)
     pointers = [ctypes.c_void_p(address(array)) for array in (x, y)]
     count = ctypes.c_int64(len(widths))
-    assert lib.sb3_sparse_act(packed, count, ctypes.c_int64(batch), *pointers) in (0, 1)
+    sizes = count, ctypes.c_int64(batch), doubles
+    assert lib.sb3_sparse_act(packed, *sizes, *pointers) in (0, 1)
 
 
 def main() -> None:

@@ -16,7 +16,8 @@ from torch import nn
 
 from sb3_sparse.engine.activations import ACTIVATIONS
 from sb3_sparse.engine.gaussian import gaussian, squashed
-from sb3_sparse.engine.inference import Inference, KeptInference
+from sb3_sparse.engine.inference import Inference
+from sb3_sparse.engine.kept import KeptInference
 from sb3_sparse.engine.linear import CompactLinear
 from sb3_sparse.engine.masked import MaskedLayer
 from sb3_sparse.engine.native import library
@@ -192,6 +193,40 @@ def test_an_input_that_is_not_contiguous_is_read_right():
     close(Inference.of([[net]])(x)[0], by_modules(net, x))
 
 
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+@pytest.mark.parametrize("count", [1, 4, 16])
+def test_observations_of_any_shape_are_flattened_and_rounded(kind, count, instructions):
+    net = network([6, 4, 3], ["compact", "masked"], nn.Tanh)
+    found = Inference.of([[net]])
+    x = np.random.default_rng(0).normal(size=(count, 2, 3)).astype(kind)
+    expected = by_modules(net, th.from_numpy(x).float().flatten(1))
+    close(found.of_observations(th.from_numpy(x))[0], expected)
+    close(th.from_numpy(found.of_array(x)[0]), expected)
+    turned = np.asfortranarray(x)
+    close(th.from_numpy(found.of_array(turned)[0]), expected)
+    close(found.of_observations(th.from_numpy(turned))[0], expected)
+
+
+@pytest.mark.parametrize(
+    "x",
+    [
+        np.ones((0, 5), np.float32),
+        np.ones((17, 5), np.float32),
+        np.ones((2, 4), np.float32),
+        np.ones((2, 5), int),
+        np.full((2, 5), np.nan, np.float32),
+        np.full((2, 5), 1e300),
+    ],
+)
+def test_arrays_that_it_does_not_take_are_left_to_the_modules(x):
+    found = Inference.of([[network([5, 4, 3], ["masked"], nn.ReLU)]])
+    assert found.of_array(x) is None
+    with th.inference_mode():
+        assert found.of_array(np.ones((2, 5), np.float32)) is not None
+    with th.autocast("cpu"):
+        assert found.of_array(np.ones((2, 5), np.float32)) is None
+
+
 def write(net):
     with th.no_grad():
         net[0].weight.mul_(3)
@@ -299,24 +334,22 @@ def test_copies_and_pickles_begin_empty():
     noise=st.floats(-4, 4, width=32),
 )
 def test_gaussian_actions_and_log_probabilities_are_those_of_the_formula(mean, log_std, noise):
-    made = th.empty(2 * 3 + 2)
     means = th.tensor([[mean, 0.5, -1.0], [0.0, 0.0, 0.0]])
     noises = th.tensor([[noise, 0.0, 1.0], [0.5, -0.5, 2.0]])
     log_stds = th.tensor([log_std, 0.0, -1.0])
-    assert not gaussian(means, log_stds, noises, made)
+    taken, log_probs = gaussian(means, log_stds, noises)
     actions = means + log_stds.exp() * noises
-    np.testing.assert_allclose(made[:6].view(2, 3), actions, rtol=1e-6, atol=1e-6)
-    taken = made[:6].view(2, 3).double()
+    np.testing.assert_allclose(taken, actions, rtol=1e-6, atol=1e-6)
+    taken = taken.double()
     std = log_stds.double().exp()
     density = th.exp(-0.5 * ((taken - means) / std) ** 2) / (std * np.sqrt(2 * np.pi))
-    np.testing.assert_allclose(made[6:], density.log().sum(dim=1), rtol=1e-5, atol=1e-4)
+    np.testing.assert_allclose(log_probs, density.log().sum(dim=1), rtol=1e-5, atol=1e-4)
 
 
 def test_a_gaussian_without_end_is_reported():
-    made = th.empty(2)
-    assert gaussian(th.zeros(1, 1), th.tensor([-200.0]), None, made)
-    assert gaussian(th.full((1, 1), th.nan), th.zeros(1), None, made)
-    assert not gaussian(th.zeros(1, 1), th.zeros(1), None, made)
+    assert gaussian(th.zeros(1, 1), th.tensor([-200.0]), None) is None
+    assert gaussian(th.full((1, 1), th.nan), th.zeros(1), None) is None
+    assert gaussian(th.zeros(1, 1), th.zeros(1), None) is not None
 
 
 @given(
@@ -328,15 +361,14 @@ def test_squashed_actions_are_those_of_the_formula(mean, log_std, noise):
     means, noises = th.tensor([[mean, 0.5]]), th.tensor([[noise, -1.0]])
     log_stds = th.tensor([[log_std, 0.1]])
     bounded = log_stds.clamp(-20, 2)
-    made = th.empty(2, 1, 2)
-    assert not squashed(means, log_stds, (-20, 2), noises, made)
+    made = squashed(means, log_stds, (-20, 2), noises)
     assert th.equal(log_stds, bounded)
     before = means + bounded.exp() * noises
     np.testing.assert_allclose(made[0], before, rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose(made[1], before.tanh(), rtol=1e-6, atol=1e-6)
-    assert not squashed(means, log_stds, (-20, 2), None, made)
-    np.testing.assert_allclose(made, th.stack([means, means.tanh()]), rtol=1e-6)
-    assert squashed(th.full((1, 2), th.nan), log_stds, (-20, 2), None, made)
+    made = squashed(means, log_stds, (-20, 2), None)
+    np.testing.assert_allclose(th.stack(made), th.stack([means, means.tanh()]), rtol=1e-6)
+    assert squashed(th.full((1, 2), th.nan), log_stds, (-20, 2), None) is None
 
 
 def test_layers_that_do_not_fit_each_other_are_left_to_the_modules():

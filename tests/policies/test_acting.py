@@ -296,6 +296,58 @@ def test_modes_are_those_that_sb3_sets(name):
     assert model.policy.training is stock.policy.training is False
 
 
+@pytest.mark.parametrize("name", ["SAC", "DQN", "PPO"])
+def test_a_part_that_was_put_into_training_mode_leaves_it_at_a_prediction(name):
+    model = make(name, policy_kwargs=WIDE)
+    model.predict(observations(model, 1))
+    acting = {"SAC": "actor", "DQN": "q_net"}.get(name)
+    part = list(model.policy.get_submodule(acting or "").modules())[-1]
+    part.train()
+    model.predict(observations(model, 1))
+    assert not part.training
+
+
+@pytest.mark.parametrize("name", ["SAC", "TD3"])
+@pytest.mark.parametrize("low", [np.float32, np.float64, "wider"])
+def test_actions_are_scaled_as_by_sb3(name, low):
+    class Task(gym.Env):
+        observation_space = spaces.Box(-1, 1, (3,), np.float32)
+        action_space = spaces.Box(-2, 3, (2,), np.float64 if low is np.float64 else np.float32)
+
+        def reset(self, *, seed=None, options=None):
+            return self.observation_space.sample(), {}
+
+    model = make(name, env=Task(), policy_kwargs=WIDE)
+    policy = model.policy
+    actions = np.random.default_rng(0).uniform(-1, 1, (4, 2)).astype(np.float32)
+    policy.scale_action(actions)
+    if low == "wider":
+        policy.action_space.low = np.full(2, -20, np.float32)
+    for ours, theirs in (
+        (policy.scale_action, BasePolicy.scale_action),
+        (policy.unscale_action, BasePolicy.unscale_action),
+    ):
+        for given in (actions, actions[0], actions.astype(np.float64)):
+            expected = theirs(policy, given)
+            np.testing.assert_array_equal(ours(given), expected)
+            assert ours(given).dtype == expected.dtype
+    obs = observations(model, 3)
+    ours, theirs = both_ways(model, lambda: model.predict(obs, deterministic=True)[:1])
+    same(ours, theirs)
+
+
+def test_a_hook_on_the_part_that_acts_is_run():
+    model = make("TD3", policy_kwargs=WIDE)
+    obs, seen = observations(model, 1), []
+    expected, _ = model.predict(obs)
+    handle = model.actor.register_forward_hook(lambda *_: seen.append(1))
+    np.testing.assert_allclose(model.predict(obs)[0], expected, atol=1e-6)
+    assert seen == [1]
+    handle.remove()
+    model.predict(obs)
+    assert seen == [1]
+
+
 def test_modules_that_come_later_are_switched_too():
     net = nn.Sequential(nn.Linear(2, 2), nn.Dropout())
     modes = Modes()

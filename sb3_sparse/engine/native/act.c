@@ -121,14 +121,22 @@ static void several(const step_t *step, int64_t batch, const float *x, float *y)
 
 static int64_t padded(int64_t features) { return (features + LANES - 1) / LANES * LANES; }
 
-int NAMED(act, SUFFIX)(const step_t *steps, int64_t count, int64_t batch, const float *x, float *y) {
-    int64_t lanes = batch == 1 ? 1 : LANES, size = batch == 1 ? 0 : steps->columns;
+int NAMED(act, SUFFIX)(const step_t *steps, int64_t count, int64_t batch, int doubles,
+                       const void *x, float *y) {
+    int64_t lanes = batch == 1 ? 1 : LANES, numbers = doubles ? batch * steps->columns : 0;
+    int64_t size = batch == 1 ? 0 : steps->columns;
     for (int64_t s = 0; s < count; s++) size += padded(steps[s].rows);
-    float *place[MOST_STEPS], *next = sb3_sparse_scratch((size_t)(padded(size * lanes) * 4));
+    size = padded(size * lanes) + padded(numbers);
+    float *place[MOST_STEPS], *next = sb3_sparse_scratch((size_t)size * 4);
     if (!next) return -1;
     const float *input = x;
+    if (doubles) {
+        for (int64_t i = 0; i < numbers; i++) next[i] = (float)((const double *)x)[i];
+        input = next;
+        next += padded(numbers);
+    }
     if (batch > 1) {
-        to_tile(x, batch, steps->columns, LANES, next);
+        to_tile(input, batch, steps->columns, LANES, next);
         input = next;
         next += steps->columns * LANES;
     }

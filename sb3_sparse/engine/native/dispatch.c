@@ -19,7 +19,7 @@ typedef struct {
     const char *name;
     void (*forward)(const layer_t *, const batch_t *);
     int (*backward)(const layer_t *, const batch_t *);
-    int (*act)(const step_t *, int64_t, int64_t, const float *, float *);
+    int (*act)(const step_t *, int64_t, int64_t, int, const void *, float *);
     int64_t (*fused)(const program_t *, int64_t, int64_t);
 } kernels_t;
 
@@ -57,7 +57,7 @@ static int runs_here(const kernels_t *kernels) {
 #define EXPORT __attribute__((visibility("default")))
 
 /* Changes with every change of what Python hands over. */
-EXPORT int sb3_sparse_version(void) { return 5; }
+EXPORT int sb3_sparse_version(void) { return 6; }
 
 openmp_t sb3_sparse_openmp;
 
@@ -118,9 +118,9 @@ EXPORT int sb3_sparse_backward(const layer_t *layers, const batch_t *batch) {
 }
 
 /* 1 if a result holds a NaN, -1 if there is no memory for it, else 0. */
-EXPORT int sb3_sparse_act(const step_t *steps, int64_t count, int64_t batch, const float *x,
-                          float *y) {
-    return chosen->act(steps, count, batch, x, y);
+EXPORT int sb3_sparse_act(const step_t *steps, int64_t count, int64_t batch, int doubles,
+                          const void *x, float *y) {
+    return chosen->act(steps, count, batch, doubles, x, y);
 }
 
 /* Operations first..last of a program; the number of the check that failed, or -1. */
@@ -129,10 +129,10 @@ EXPORT int64_t sb3_sparse_fused(const program_t *program, int64_t first, int64_t
 }
 
 /* Actions mean + std * noise (without noise: the mean) of `count` Gaussians of `size` dimensions, and
-   their log probabilities. 1 if one is not finite, else 0. */
+   behind them their log probabilities. 1 if one is not finite, else 0. */
 EXPORT int sb3_sparse_gaussian(int64_t count, int64_t size, const float *mean, const float *log_std,
-                               const float *noise, float *action, float *log_prob) {
-    float wrong = 0;
+                               const float *noise, float *action) {
+    float wrong = 0, *log_prob = action + count * size;
     for (int64_t n = 0; n < count; n++) {
         log_prob[n] = 0;
         for (int64_t d = 0; d < size; d++) {
@@ -147,10 +147,30 @@ EXPORT int sb3_sparse_gaussian(int64_t count, int64_t size, const float *mean, c
     return wrong != wrong;
 }
 
-/* Actions tanh(u) with u = mean + e^log_std * noise (without noise: the mean), element by element, and
-   u itself; log_std is brought into its bounds. 1 if one is not finite, else 0. */
+/* Actions of a box with bounds of `size` dimensions, each step rounded as NumPy rounds it: clipped (0), from
+   [-1, 1] to the bounds (1), or from the bounds to [-1, 1] (2). `count` numbers in all. */
+EXPORT void sb3_sparse_box(int how, int64_t count, int64_t size, const float *low, const float *high,
+                           const float *from, float *to) {
+    for (int64_t i = 0, d = 0; i < count; i++, d = d + 1 < size ? d + 1 : 0) {
+        float a = from[i], width = high[d] - low[d];
+        if (how == 0) {
+            a = a < low[d] ? low[d] : a;
+            to[i] = a > high[d] ? high[d] : a;
+        } else if (how == 1) {
+            volatile float above = 0.5f * (a + 1.0f) * width; /* no fused multiply-add */
+            to[i] = low[d] + above;
+        } else {
+            volatile float twice = 2.0f * ((a - low[d]) / width);
+            to[i] = twice - 1.0f;
+        }
+    }
+}
+
+/* u = mean + e^log_std * noise (without noise: the mean), element by element, and behind them actions
+   tanh(u); log_std is brought into its bounds. 1 if one is not finite, else 0. */
 EXPORT int sb3_sparse_squashed(int64_t count, double least, double most, const float *mean,
-                               float *log_std, const float *noise, float *gaussian, float *action) {
+                               float *log_std, const float *noise, float *gaussian) {
+    float *action = gaussian + count;
     float wrong = 0, low = (float)least, high = (float)most;
     for (int64_t i = 0; i < count; i++) {
         log_std[i] = log_std[i] < low ? low : log_std[i] > high ? high : log_std[i];

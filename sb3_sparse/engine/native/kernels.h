@@ -103,6 +103,6 @@ float *sb3_sparse_scratch(size_t size);
 #define DECLARE(suffix)                                                    \
     void NAMED(forward, suffix)(const layer_t *, const batch_t *);         \
     int NAMED(backward, suffix)(const layer_t *, const batch_t *);         \
-    int NAMED(act, suffix)(const step_t *, int64_t, int64_t, const float *, float *);
+    int NAMED(act, suffix)(const step_t *, int64_t, int64_t, int, const void *, float *);
 
 #endif

@@ -12,7 +12,7 @@ import torch as th
 from sb3_sparse.errors import ConfigError, MissingKernels
 
 PATH = Path(__file__).with_name("kernels.so")
-VERSION = 5
+VERSION = 6
 """Of what the two sides hand each other; ``dispatch.c`` has the same."""
 
 
@@ -66,16 +66,23 @@ def library() -> ctypes.CDLL:
         ctypes.c_void_p,
         ctypes.c_int64,
         ctypes.c_int64,
+        ctypes.c_int,
         ctypes.c_void_p,
         ctypes.c_void_p,
     ]
     found.sb3_sparse_fused.restype = ctypes.c_int64
     found.sb3_sparse_fused.argtypes = [ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64]
-    found.sb3_sparse_gaussian.argtypes = [*(ctypes.c_int64,) * 2, *(ctypes.c_void_p,) * 5]
+    found.sb3_sparse_gaussian.argtypes = [*(ctypes.c_int64,) * 2, *(ctypes.c_void_p,) * 4]
+    found.sb3_sparse_box.argtypes = [
+        ctypes.c_int,
+        *(ctypes.c_int64,) * 2,
+        *(ctypes.c_void_p,) * 4,
+    ]
+    found.sb3_sparse_box.restype = None
     found.sb3_sparse_squashed.argtypes = [
         ctypes.c_int64,
         *(ctypes.c_double,) * 2,
-        *(ctypes.c_void_p,) * 5,
+        *(ctypes.c_void_p,) * 4,
     ]
     _use(found, found.sb3_sparse_instructions(0).decode())
     _share_threads(found)

@@ -1,0 +1,51 @@
+"""Actions within their bounds, and between these and [-1, 1], in one call of the kernels each."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from numpy.typing import NDArray
+
+from sb3_sparse.engine.native.library import library
+from sb3_sparse.engine.room import FLOAT, Room
+
+Array = NDArray[Any]
+CLIP, UNSCALE, SCALE = range(3)
+
+
+class Bounds:
+    """Lowest and highest actions, ready for the kernels. A copy or pickle of it is None.
+
+    :param low: lowest actions, float32
+    :param high: highest actions, float32, of the same shape
+    """
+
+    def __init__(self, low: Array, high: Array) -> None:
+        self.low, self.high = low, high
+        self._shape, self._size = low.shape, low.size
+        self._places = low.ctypes.data, high.ctypes.data
+        self._call = library().sb3_sparse_box
+
+    def __reduce__(self) -> Any:
+        return type(None), ()
+
+    @staticmethod
+    def readable(low: Array, high: Array) -> bool:
+        """Whether the kernels can read them."""
+        return all(
+            bound.dtype == FLOAT and bound.flags.c_contiguous and bound.shape == low.shape
+            for bound in (low, high)
+        )
+
+    def of(self, actions: Array, how: int) -> Array | None:
+        """New actions, as NumPy computes them; None for those that are no float32 of that shape.
+
+        :param actions: one, or shape ``(n, *shape of one)``
+        :param how: ``CLIP`` to the bounds; ``UNSCALE`` from [-1, 1] to them; ``SCALE`` back
+        """
+        shape = actions.shape
+        if actions.dtype != FLOAT or (shape[1:] != self._shape and shape != self._shape):
+            return None
+        room = Room(actions.size)
+        self._call(how, actions.size, self._size, *self._places, actions.tobytes(), room.memory)
+        return room.array(shape)

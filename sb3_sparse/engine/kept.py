@@ -1,0 +1,39 @@
+"""Keeps what computes networks at once, for as long as their modules are the same."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from torch import nn
+
+from sb3_sparse.engine.inference import Inference
+from sb3_sparse.engine.paths import Paths, modules_of
+from sb3_sparse.engine.watch import Watch
+
+
+class KeptInference:
+    """An inference that is made anew when modules have changed. Copies and pickles begin empty."""
+
+    def __init__(self) -> None:
+        self._watch: Watch | None = None
+        self._inference: Inference | None = None
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> KeptInference:
+        return KeptInference()
+
+    def __reduce__(self) -> Any:
+        return KeptInference, ()
+
+    def get(self, find: Callable[[], tuple[Paths, list[nn.Module]]]) -> Inference | None:
+        """The inference; None where the modules must be called one by one.
+
+        :param find: the paths, and the modules around them from the outermost, whose hooks are run
+            anyhow, to those that the inference passes over
+        """
+        if self._watch is None or not self._watch.unchanged():
+            paths, around = find()
+            watch = Watch([*around, *modules_of(paths)])
+            self._inference = Inference.of(paths, around[1:])
+            self._watch = watch  # last: another thread may be looking
+        return self._inference
