@@ -132,9 +132,9 @@ def test_a_buffer_that_is_replaced_in_the_middle():
         model = learn(make(library, "SAC"))
         old = model.replay_buffer
         model.replay_buffer = Weighted(100, model.observation_space, model.action_space, "cpu")
+        names = ("observations", "next_observations", "actions", "rewards", "dones")
         for row in range(40):
-            model.replay_buffer.add(old.observations[row], old.next_observations[row],
-                                    old.actions[row], old.rewards[row], old.dones[row], [{}])  # fmt: skip
+            model.replay_buffer.add(*(getattr(old, name)[row] for name in names), [{}])
         return learn(model, steps=10)
 
     assert_alike(train(sb3_sparse), train(stable_baselines3))
