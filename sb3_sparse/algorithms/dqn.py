@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import numpy as np
 import stable_baselines3
 
 from sb3_sparse.algorithms.off_policy import OffPolicy
-from sb3_sparse.algorithms.training import parts
+from sb3_sparse.algorithms.training import mean, parts
 from sb3_sparse.fused.errors import NotCovered
 from sb3_sparse.fused.machine import Machine
 from sb3_sparse.fused.program import Program
@@ -57,4 +56,4 @@ class DQN(OffPolicy, stable_baselines3.DQN):
             losses.append(machine.number("loss"))
         self._n_updates += gradient_steps
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        self.logger.record("train/loss", np.mean(losses))
+        self.logger.record("train/loss", mean(losses))

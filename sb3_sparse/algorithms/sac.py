@@ -11,7 +11,7 @@ import torch as th
 from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN
 
 from sb3_sparse.algorithms.off_policy import OffPolicy
-from sb3_sparse.algorithms.training import parts
+from sb3_sparse.algorithms.training import mean, parts
 from sb3_sparse.fused.distributions import least_of, squashed_gaussian
 from sb3_sparse.fused.errors import NotCovered
 from sb3_sparse.fused.machine import Machine
@@ -123,7 +123,7 @@ class SAC(OffPolicy, stable_baselines3.SAC):
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         for name in ("ent_coef", "actor_loss", "critic_loss", "ent_coef_loss"):
             if name in logged:
-                self.logger.record(f"train/{name}", np.mean(logged[name]))
+                self.logger.record(f"train/{name}", mean(logged[name]))
 
     def _refuse(self, machine: Machine, data: Any, noise: str) -> None:
         """Let SB3's distribution say what it does not take: means that are not finite, say."""

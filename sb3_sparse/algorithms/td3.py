@@ -7,7 +7,7 @@ import stable_baselines3
 import torch as th
 
 from sb3_sparse.algorithms.off_policy import OffPolicy
-from sb3_sparse.algorithms.training import parts
+from sb3_sparse.algorithms.training import mean, parts
 from sb3_sparse.fused.distributions import least_of
 from sb3_sparse.fused.errors import NotCovered
 from sb3_sparse.fused.machine import Machine
@@ -90,8 +90,8 @@ class TD3(OffPolicy, stable_baselines3.TD3):
                 actor_losses.append(machine.number("actor_loss"))
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         if actor_losses:
-            self.logger.record("train/actor_loss", np.mean(actor_losses))
-        self.logger.record("train/critic_loss", np.mean(critic_losses))
+            self.logger.record("train/actor_loss", mean(actor_losses))
+        self.logger.record("train/critic_loss", mean(critic_losses))
 
 
 class DDPG(TD3, stable_baselines3.DDPG):

@@ -7,6 +7,7 @@ from itertools import chain
 from operator import attrgetter, itemgetter
 from typing import Any
 
+import numpy as np
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
@@ -78,7 +79,7 @@ class Training:
             _check_policy(policy, methods)
             modules = list(policy.modules())
             self._hooked = list(map(vars, modules))
-            self._tensors = list(policy.parameters())
+            self._tensors = [*_trained(policy)]
             self._adjustable = [m for m in modules if isinstance(m, ADJUSTABLE)]
             self._acting = [vars(m) for m in modules if "action_dist" in vars(m)]
             self._settings = self._settings_now()
@@ -203,6 +204,13 @@ def features(policy: BasePolicy, obs: Any) -> th.Tensor:
     prepared = preprocess_obs(obs, policy.observation_space, policy.normalize_images)
     assert isinstance(prepared, th.Tensor)
     return prepared.flatten(1)
+
+
+def mean(numbers: Sequence[float]) -> Any:
+    """As ``np.mean``; of one number, as there is where each step is followed by a gradient step,
+    that one.
+    """
+    return np.float64(numbers[0]) if len(numbers) == 1 else np.mean(numbers)
 
 
 class Fused(BaseAlgorithm):

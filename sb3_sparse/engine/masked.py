@@ -19,6 +19,7 @@ from sb3_sparse.engine.gradients import (
 from sb3_sparse.engine.kernels import Kernel
 from sb3_sparse.engine.layers import SparseLayer, moments_of
 from sb3_sparse.engine.linear import MASK_KEY
+from sb3_sparse.engine.native.library import have_kernels, library
 
 FLOAT_MASK_KEY = "weight_mask_float"
 
@@ -28,6 +29,22 @@ def _ignore_mask_key(
 ) -> None:
     """Pre-load hook of a target layer, which has no mask of its own."""
     state_dict.pop(prefix + MASK_KEY, None)
+
+
+def clear(weight: th.Tensor, mask: th.Tensor) -> None:
+    """Set a weight to 0 where its mask is 0.
+
+    Torch counts no write, so that a graph that is alive, perhaps in another thread, goes on to be
+    valid.
+    """
+    if have_kernels() and all(map(_is_plain, (weight, mask))):
+        library().sb3_sparse_clear(weight.data_ptr(), mask.data_ptr(), weight.numel())
+    else:
+        weight.data.mul_(mask)
+
+
+def _is_plain(tensor: th.Tensor) -> bool:
+    return tensor.is_cpu and tensor.dtype is th.float32 and tensor.is_contiguous()
 
 
 class MaskedLayer(SparseLayer):
@@ -46,6 +63,7 @@ class MaskedLayer(SparseLayer):
         self._targets: list[Kernel] = []
         self._connections = object()
         self._seen: tuple[int, int] | None = None
+        self._settled: list[tuple[int, int, object]] = []
         ones = th.ones_like(module.weight, requires_grad=False)
         module.register_buffer(MASK_KEY, ones.bool())
         module.register_buffer(FLOAT_MASK_KEY, ones, persistent=False)
@@ -111,7 +129,7 @@ class MaskedLayer(SparseLayer):
 
     def mask_targets(self) -> None:
         for target in self.targets:
-            target.weight.data.mul_(self.float_mask)
+            clear(target.weight, self.float_mask)
 
     def set_mask(self, mask: NDArray[np.bool_]) -> None:
         """Replace the mask and set what it has inactive to 0.
@@ -131,6 +149,14 @@ class MaskedLayer(SparseLayer):
             self.weight.copy_(dense.view(self.shape))
         self.remask()
 
+    def settle_targets(self, soft: bool) -> None:
+        targets = [
+            (t.weight._version, t.weight.data_ptr(), self._connections) for t in self._targets
+        ]
+        if soft or targets != self._settled:
+            super().settle_targets(soft)
+            self._settled = targets
+
     def _dense_targets(self) -> Iterable[NDArray[np.float32]]:
         return (target.weight.detach().cpu().numpy() for target in self._targets)
 
@@ -144,9 +170,8 @@ class MaskedLayer(SparseLayer):
             self.weight.mul_(self.float_mask)
 
     def remask(self) -> None:
-        # Through .data: a graph that is alive, perhaps in another thread, goes on to be valid.
         if not self.full:
-            self.weight.data.mul_(self.float_mask)
+            clear(self.weight, self.float_mask)
             self.trust()
 
     def notice(self) -> None:

@@ -128,6 +128,11 @@ EXPORT int64_t sb3_sparse_fused(const program_t *program, int64_t first, int64_t
     return chosen->fused(program, first, last);
 }
 
+/* Sets to 0 what the mask has inactive. */
+EXPORT void sb3_sparse_clear(float *weight, const float *mask, int64_t count) {
+    for (int64_t i = 0; i < count; i++) weight[i] = mask[i] != 0 ? weight[i] : 0;
+}
+
 /* Actions mean + std * noise (without noise: the mean) of `count` Gaussians of `size` dimensions, and
    behind them their log probabilities. 1 if one is not finite, else 0. */
 EXPORT int sb3_sparse_gaussian(int64_t count, int64_t size, const float *mean, const float *log_std,

@@ -72,6 +72,7 @@ def library() -> ctypes.CDLL:
     ]
     found.sb3_sparse_fused.restype = ctypes.c_int64
     found.sb3_sparse_fused.argtypes = [ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64]
+    found.sb3_sparse_clear.argtypes = [ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64]
     found.sb3_sparse_gaussian.argtypes = [*(ctypes.c_int64,) * 2, *(ctypes.c_void_p,) * 4]
     found.sb3_sparse_box.argtypes = [
         ctypes.c_int,
@@ -111,6 +112,12 @@ def why_missing() -> str | None:
     except MissingKernels as error:
         return str(error)
     return None
+
+
+@cache
+def have_kernels() -> bool:
+    """Whether the kernels run here; as :func:`why_missing`, but asked once."""
+    return why_missing() is None
 
 
 def instruction_sets() -> list[str]:

@@ -93,12 +93,12 @@ INLINE void gather_rows(int N, int U, int64_t step, int64_t rows, const int32_t 
         for (; k + U <= end; k += U)
             for (int u = 0; u < U; u++) {
                 const float *from = x + (int64_t)column[k + u] * step;
-                vec w = value[k + u] + (vec){0};
+                vec w = value[k + u] - (vec){0};
                 for (int j = 0; j < N; j++) sum[u * N + j] += w * LOAD(from + j * WIDTH);
             }
         for (; k < end; k++) {
             const float *from = x + (int64_t)column[k] * step;
-            vec w = value[k] + (vec){0};
+            vec w = value[k] - (vec){0};
             for (int j = 0; j < N; j++) sum[j] += w * LOAD(from + j * WIDTH);
         }
         for (int i = N; i < N * U; i++) sum[i % N] += sum[i];
