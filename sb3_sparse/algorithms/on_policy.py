@@ -14,12 +14,11 @@ from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
 from stable_baselines3.common.utils import explained_variance
 
 from sb3_sparse.algorithms.training import Fused, features, parts
-from sb3_sparse.engine.native.library import bits_of
 from sb3_sparse.fused.distributions import bernoulli, categorical, gaussian, multi_categorical
 from sb3_sparse.fused.errors import NotCovered
 from sb3_sparse.fused.inputs import TYPES
 from sb3_sparse.fused.machine import Machine
-from sb3_sparse.fused.optimizers import KNOWN, Known
+from sb3_sparse.fused.optimizers import KNOWN, Known, rmsprop
 from sb3_sparse.fused.program import Program
 from sb3_sparse.fused.values import Value
 from sb3_sparse.policies.shortcut import takes_vectors
@@ -34,18 +33,9 @@ METHODS: dict[str, tuple[str, ...]] = {
 }
 
 
-def _rmsprop(
-    rate: float, alpha: float, epsilon: float, decay: float, *others: Any
-) -> list[int] | None:
-    if any(others):
-        return None
-    return [1, *map(bits_of, map(float, (rate, 0.0, alpha, epsilon, decay))), 0]
-
-
 KNOWN[RMSpropTFLike] = Known(
-    ("lr", "alpha", "eps", "weight_decay", "momentum", "centered"), _rmsprop, ("", "square_avg")
+    ("lr", "alpha", "eps", "weight_decay", "momentum", "centered"), rmsprop(2), ("", "square_avg")
 )
-
 
 ARRAYS = {
     "obs": "observations",

@@ -56,7 +56,44 @@ _ADAM = Known(
     _adam,
     ("exp_avg", "exp_avg_sq"),
 )
-KNOWN: dict[type[th.optim.Optimizer], Known] = {th.optim.Adam: _ADAM, th.optim.AdamW: _ADAM}
+
+
+def rmsprop(kind: int) -> Callable[..., list[int] | None]:
+    """What RMSprop is set to; its moments decay at ``alpha``.
+
+    :param kind: 1, or 2 for TensorFlow's way, with epsilon within the root
+    """
+
+    def fields(
+        rate: Any, alpha: float, epsilon: float, decay: float, *others: Any
+    ) -> list[int] | None:
+        if any(others) or isinstance(rate, th.Tensor):
+            return None
+        return [kind, *map(bits_of, map(float, (rate, 0.0, alpha, epsilon, decay))), 0]
+
+    return fields
+
+
+_RMSPROP = Known(
+    (
+        "lr",
+        "alpha",
+        "eps",
+        "weight_decay",
+        "momentum",
+        "centered",
+        "maximize",
+        "capturable",
+        "differentiable",
+    ),
+    rmsprop(1),
+    ("", "square_avg"),
+)
+KNOWN: dict[type[th.optim.Optimizer], Known] = {
+    th.optim.Adam: _ADAM,
+    th.optim.AdamW: _ADAM,
+    th.optim.RMSprop: _RMSPROP,
+}
 
 
 class Steps:

@@ -391,10 +391,10 @@ INLINE void adam(const adam_t *s, vec *p, vec *m, vec *v, vec g) {
     *p -= s->rate * *m / (root_of(*v) / s->root + s->epsilon);
 }
 
-INLINE void rmsprop(const adam_t *s, vec *p, vec *v, vec g) {
+INLINE void rmsprop(const adam_t *s, int within, vec *p, vec *v, vec g) {
     g += s->decay * *p;
     *v = s->second * *v + s->squared * (g * g);
-    *p -= s->rate * g / root_of(*v + s->epsilon);
+    *p -= s->rate * g / (within ? root_of(*v + s->epsilon) : root_of(*v) + s->epsilon);
 }
 
 static void step_parameter(const parameter_t *p, const group_t *group) {
@@ -427,7 +427,7 @@ static void step_parameter(const parameter_t *p, const group_t *group) {
         if (group->optimizer == ADAM)
             adam(&s, &x, &m, &v, g);
         else
-            rmsprop(&s, &x, &v, g);
+            rmsprop(&s, group->optimizer == RMSPROP_TF, &x, &v, g);
         if (whole) {
             STORE(p->number + k, x), STORE(p->second + k, v);
             if (p->first) STORE(p->first + k, m);

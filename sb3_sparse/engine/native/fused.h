@@ -47,11 +47,11 @@ typedef struct {
 
 /* Settings of an optimizer's parameter group. */
 typedef struct {
-    int64_t optimizer; /* ADAM or RMSPROP_TF */
+    int64_t optimizer; /* ADAM, ... */
     double rate, beta1, beta2, epsilon, decay;
     int64_t decoupled; /* whether `decay` is AdamW's */
 } group_t;
-enum { ADAM, RMSPROP_TF };
+enum { ADAM, RMSPROP, RMSPROP_TF /* epsilon within the root */ };
 
 /* Rows [batch, features] that come from outside. */
 typedef struct {
