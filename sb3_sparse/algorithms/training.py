@@ -218,6 +218,11 @@ class Fused(BaseAlgorithm):
 
     _training: Training
 
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        if isinstance(self.policy, SparsePolicyMixin):
+            self.policy._quicken()  # also where it has no zeros, and so would stay stock SB3's
+
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_training"]
 
