@@ -219,7 +219,7 @@ class Fused(BaseAlgorithm):
     _training: Training
 
     def _setup_model(self) -> None:
-        super()._setup_model()
+        super()._setup_model()  # type: ignore[safe-super]
         if isinstance(self.policy, SparsePolicyMixin):
             self.policy._quicken()  # also where it has no zeros, and so would stay stock SB3's
 

@@ -19,7 +19,7 @@ from sb3_sparse.engine.gradients import (
 from sb3_sparse.engine.kernels import Kernel
 from sb3_sparse.engine.layers import SparseLayer, moments_of
 from sb3_sparse.engine.linear import MASK_KEY
-from sb3_sparse.engine.native.library import have_kernels, library
+from sb3_sparse.engine.native.library import library, why_missing
 
 FLOAT_MASK_KEY = "weight_mask_float"
 
@@ -37,7 +37,7 @@ def clear(weight: th.Tensor, mask: th.Tensor) -> None:
     Torch counts no write, so that a graph that is alive, perhaps in another thread, goes on to be
     valid.
     """
-    if have_kernels() and all(map(_is_plain, (weight, mask))):
+    if why_missing() is None and all(map(_is_plain, (weight, mask))):
         library().sb3_sparse_clear(weight.data_ptr(), mask.data_ptr(), weight.numel())
     else:
         weight.data.mul_(mask)

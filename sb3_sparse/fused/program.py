@@ -203,8 +203,7 @@ class Program:
         place = self._places.setdefault(id(module), len(self.layers))
         if place == len(self.layers):
             self.layers.append(module)
-            slot = self.slot(module.weight, place)
-            self.record("PACK", None, number=slot, tiled=False)
+            self.record("PACK", None, number=self.slot(module.weight, place), tiled=False)
         return place
 
     def slot(

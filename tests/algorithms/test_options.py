@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -23,8 +25,14 @@ from torch import nn
 import sb3_sparse
 
 
-def linear(start: float):
-    return lambda remaining: start * (0.1 + remaining)
+@dataclass(frozen=True)
+class Linear:
+    """A schedule; what it prints is the same in every process."""
+
+    start: float
+
+    def __call__(self, remaining):
+        return self.start * (0.1 + remaining)
 
 
 LEAN = dict(optimize_memory_usage=True, replay_buffer_kwargs=dict(handle_timeout_termination=False))
@@ -33,7 +41,7 @@ OPTIONS = [
     ("SAC", dict(ent_coef="auto_0.3", target_entropy=-1.0)),
     ("SAC", dict(gradient_steps=3, target_update_interval=2, train_freq=3)),
     ("SAC", dict(gradient_steps=-1, train_freq=(1, "episode"))),
-    ("SAC", dict(learning_rate=linear(1e-3), tau=0.5, gamma=0.9)),
+    ("SAC", dict(learning_rate=Linear(1e-3), tau=0.5, gamma=0.9)),
     ("SAC", dict(n_steps=3, gamma=0.7)),
     ("SAC", dict(policy_kwargs=dict(n_critics=1))),
     ("SAC", dict(policy_kwargs=dict(n_critics=3))),
@@ -47,13 +55,13 @@ OPTIONS = [
     ("TD3", dict(policy_delay=3, target_policy_noise=0.4, target_noise_clip=0.2)),
     ("TD3", dict(policy_delay=1, gradient_steps=2, tau=0.1, n_steps=2)),
     ("TD3", dict(policy_kwargs=dict(n_critics=3))),
-    ("TD3", dict(learning_rate=linear(1e-3), policy_kwargs=dict(weight_decay=1e-2))),
+    ("TD3", dict(learning_rate=Linear(1e-3), policy_kwargs=dict(weight_decay=1e-2))),
     ("DDPG", dict(policy_kwargs=dict(n_critics=2), n_steps=2)),
     ("DDPG", dict(tau=0.9, gradient_steps=2)),
     ("DQN", dict(max_grad_norm=0.05, tau=0.3)),
     ("DQN", dict(n_steps=3, gradient_steps=2, train_freq=2)),
-    ("DQN", dict(learning_rate=linear(1e-3), gamma=0.5)),
-    ("PPO", dict(clip_range=linear(0.01), clip_range_vf=linear(0.02), learning_rate=linear(1e-3))),
+    ("DQN", dict(learning_rate=Linear(1e-3), gamma=0.5)),
+    ("PPO", dict(clip_range=Linear(0.01), clip_range_vf=Linear(0.02), learning_rate=Linear(1e-3))),
     ("PPO", dict(normalize_advantage=False, ent_coef=0.05, vf_coef=0.1, max_grad_norm=0.05)),
     ("PPO", dict(target_kl=1e-3, learning_rate=3e-3, clip_range=0.02)),
     ("PPO", dict(batch_size=31)),  # the last batch is one transition, which is not normalised
@@ -62,7 +70,7 @@ OPTIONS = [
     ("PPO", dict(policy_kwargs=dict(net_arch=[], log_std_init=-1.0))),
     ("PPO", dict(policy_kwargs=dict(ortho_init=False, share_features_extractor=False))),
     ("A2C", dict(normalize_advantage=True, ent_coef=0.05, vf_coef=0.1, max_grad_norm=0.05)),
-    ("A2C", dict(use_rms_prop=False, learning_rate=linear(1e-3), gae_lambda=0.9)),
+    ("A2C", dict(use_rms_prop=False, learning_rate=Linear(1e-3), gae_lambda=0.9)),
     ("A2C", dict(rms_prop_eps=1e-3, policy_kwargs=dict(weight_decay=1e-2))),
 ]  # fmt: skip
 

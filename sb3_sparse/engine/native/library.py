@@ -114,12 +114,6 @@ def why_missing() -> str | None:
     return None
 
 
-@cache
-def have_kernels() -> bool:
-    """Whether the kernels run here; as :func:`why_missing`, but asked once."""
-    return why_missing() is None
-
-
 def instruction_sets() -> list[str]:
     """The instruction sets that run here, the best first."""
     found = library()
