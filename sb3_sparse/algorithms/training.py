@@ -221,7 +221,7 @@ class Fused(BaseAlgorithm):
     def _setup_model(self) -> None:
         super()._setup_model()  # type: ignore[safe-super]
         if isinstance(self.policy, SparsePolicyMixin):
-            self.policy._quicken()  # also where it has no zeros, and so would stay stock SB3's
+            self.policy.quicken()  # also where it has no zeros, and so would stay stock SB3's
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_training"]

@@ -129,7 +129,7 @@ class SparsePolicyMixin(Acts):
         if compute == "sparse":
             self.sparse.compact(self, allowed)
         if not all(layer.full and layer.final_nnz == layer.size for layer in self.sparse.layers):
-            self._quicken()  # a policy without zeros stays stock SB3's to the bit
+            self.quicken()  # a policy without zeros stays stock SB3's to the bit
         self.sparse.attach()
 
     def __deepcopy__(self: Sparse, memo: dict[int, Any]) -> Sparse:
@@ -167,7 +167,7 @@ class SparsePolicyMixin(Acts):
         finally:
             self.features_extractor_kwargs = given
 
-    def _quicken(self) -> None:
+    def quicken(self) -> None:
         """Replace what SB3 computes in more steps than it needs."""
 
     def _initial_gain(self, layer_name: str) -> float:

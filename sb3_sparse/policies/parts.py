@@ -113,7 +113,7 @@ class ActsByPart(Acts):
     acting: ClassVar[str]
     """Name of the part."""
 
-    def _quicken(self) -> None:
+    def quicken(self) -> None:
         part = unwrapped(self.get_submodule(self.acting))
         assert isinstance(part, ActingPart)
         part.quicken()
