@@ -14,6 +14,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from sb3_sparse.algorithms.table import HOMES
 from sb3_sparse.lazy import lazily
 
 if TYPE_CHECKING:
@@ -53,12 +54,7 @@ if find_spec("sb3_contrib"):
 __getattr__, __dir__ = lazily(
     __name__,
     {
-        "A2C": "algorithms.a2c",
-        "DDPG": "algorithms.td3",
-        "DQN": "algorithms.dqn",
-        "PPO": "algorithms.ppo",
-        "SAC": "algorithms.sac",
-        "TD3": "algorithms.td3",
+        **{name: f"algorithms.{home}" for name, home in HOMES.items()},
         "SparseActorCriticPolicy": "policies.actor_critic",
         "SparseDQNPolicy": "policies.dqn",
         "SparsePolicy": "policies.aliases",

@@ -14,6 +14,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from torch.nn import functional as F
 from torch.utils import _pytree as pytree
 
+from sb3_sparse.algorithms.table import trainer_of
 from sb3_sparse.errors import ConfigError
 
 Samples = dict[str, Any]
@@ -147,7 +148,7 @@ def losses_for(model: BaseAlgorithm) -> Callable[[Any, Any, Any], list[Loss]]:
     :raises ConfigError: for an algorithm whose ``train()`` is none of the known ones
     """
     for algorithm, losses in LOSSES.items():
-        if isinstance(model, algorithm) and type(model).train is algorithm.train:
+        if trainer_of(type(model)) is algorithm:
             return losses
     raise ConfigError(
         f"gradient_snr has no loss of {type(model).__name__}; supported are "

@@ -8,6 +8,7 @@ from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 
+from sb3_sparse.algorithms.table import trainer_of
 from sb3_sparse.errors import ConfigError
 
 
@@ -90,10 +91,10 @@ def passes_of(model: BaseAlgorithm) -> list[Pass]:
 
     :raises ConfigError: for an algorithm whose ``train()`` is none of the known ones
     """
-    for cls in type(model).__mro__:
-        known = cls.__module__.startswith(("stable_baselines3.", "sb3_contrib."))
-        if known and cls.__name__ in PASSES and type(model).train is cls.train:  # type: ignore[attr-defined]
-            return PASSES[cls.__name__](model)
+    trainer = trainer_of(type(model))
+    known = trainer.__module__.startswith(("stable_baselines3.", "sb3_contrib."))
+    if known and trainer.__name__ in PASSES:
+        return PASSES[trainer.__name__](model)
     raise ConfigError(
         f"how often {type(model).__name__} runs its networks in a gradient step is not known; it "
         f"is for {', '.join(PASSES)} and DDPG. flops(model.policy) counts forward passes alone"

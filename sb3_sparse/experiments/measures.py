@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from sb3_sparse.algorithms.table import trainer_of
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.sparsity.numeric import is_number, is_whole
 
@@ -59,7 +60,7 @@ class Measures:
         if "snr" in self.during:
             from sb3_sparse.analysis.losses import LOSSES
 
-            if algorithm not in LOSSES:
+            if trainer_of(algorithm) not in LOSSES:
                 known = ", ".join(one.__name__ for one in LOSSES)
                 raise ConfigError(f"snr is measured of {known}, got {algorithm.__name__}")
 

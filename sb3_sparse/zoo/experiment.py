@@ -23,7 +23,7 @@ from sb3_sparse.zoo.checkpoint import REPLAY_BUFFER
 from sb3_sparse.zoo.mujoco import mujoco_warns_once
 from sb3_sparse.zoo.record import write_record
 from sb3_sparse.zoo.replay import end_episodes, restore_buffer
-from sb3_sparse.zoo.run import Run
+from sb3_sparse.zoo.run import Run, algorithms
 
 try:
     from rl_zoo3.callbacks import SaveVecNormalizeCallback
@@ -102,13 +102,41 @@ class Experiment(ExperimentManager):
         return envs
 
     def setup(self) -> BaseAlgorithm:
-        """The model, new or as the checkpoint has it."""
+        """The model, new or as the checkpoint has it, with its environment.
+
+        The steps are those of rl-zoo's ``setup_experiment``, which knows stock algorithms only.
+        """
         with quiet():
-            made = self.setup_experiment()
-        assert made is not None  # it is only when optimizing hyperparameters
-        model = made[0]
+            hyperparams, saved = self.read_hyperparameters()
+            hyperparams, self.env_wrapper, self.callbacks, self.vec_env_wrapper = (
+                self._preprocess_hyperparams(hyperparams)
+            )
+            self.create_log_folder()  # type: ignore[no-untyped-call]
+            self.create_callbacks()  # type: ignore[no-untyped-call]
+            env = self.create_envs(self.n_envs)
+            hyperparams = self._preprocess_action_noise(hyperparams, saved, env)
+            model = self._make(hyperparams, env)
+            self._save_config(saved)
         if isinstance(model, OffPolicyAlgorithm) and self.continue_training and not self.trained:
             self._restore_buffer(model)
+        return model
+
+    def _make(self, hyperparams: dict[str, Any], env: VecEnv) -> BaseAlgorithm:
+        algorithm: Any = algorithms()[self.algo]
+        kwargs = {
+            **hyperparams,
+            "env": env,
+            "tensorboard_log": self.tensorboard_log,
+            "seed": self.seed,
+            "verbose": self.verbose,
+            "device": self.device,
+        }
+        if self.continue_training:
+            for name in ("policy", "policy_kwargs"):  # the file has them
+                kwargs.pop(name, None)
+            model: BaseAlgorithm = algorithm.load(self.trained_agent, **kwargs)
+        else:
+            model = algorithm(**kwargs)
         return model
 
     def _restore_buffer(self, model: OffPolicyAlgorithm) -> None:
@@ -172,5 +200,4 @@ def loadable_algorithms() -> list[str]:
 
 def load_for_prediction(algo: str, path: Path) -> BaseAlgorithm:
     """A saved model without its replay buffer."""
-    model: BaseAlgorithm = load_without_buffer(ALGOS[algo], path)
-    return model
+    return load_without_buffer({**ALGOS, **algorithms()}[algo], path)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sb3_sparse.algorithms.table import algorithm_named
 from sb3_sparse.errors import ConfigError, did_you_mean
 from sb3_sparse.policies.names import algorithm_names
 from sb3_sparse.sparsity.distributions import check_distribution, check_sparsity
@@ -219,6 +220,4 @@ def _is_path(text: str) -> bool:
 
 def algorithms() -> dict[str, type[BaseAlgorithm]]:
     """Supported algorithms by lower-case name."""
-    from sb3_sparse.policies.aliases import supported_algorithms
-
-    return {name.lower(): algorithm for name, algorithm in supported_algorithms().items()}
+    return {name.lower(): algorithm_named(name) for name in algorithm_names()}

@@ -15,6 +15,8 @@ from stable_baselines3.dqn.policies import DQNPolicy
 from support import make
 from torch.utils.flop_counter import FlopCounterMode
 
+import sb3_sparse
+from sb3_sparse.algorithms.table import HOMES
 from sb3_sparse.analysis import flops
 from sb3_sparse.errors import ConfigError, UnsupportedError
 from sb3_sparse.networks import ImpalaCNN
@@ -94,6 +96,12 @@ def test_gradient_steps_by_hand():
     assert td3.step("actor") == (1 + 3 / 4) * td3.forward("actor")
     # own loss 3, target 1; of the actor's loss every fourth time forward and through, one of two
     assert td3.step("critic") == (3 + 1 + 2 / 4 / 2) * td3.forward("critic")
+
+
+@pytest.mark.parametrize("name", sorted(HOMES))
+def test_gradient_steps_of_our_algorithms_count_as_those_of_stock(name):
+    ours = flops(make(getattr(sb3_sparse, name)))
+    assert ours.step() == flops(make(name)).step() > 0
 
 
 def test_shared_features_count_once_for_ppo_and_without_the_actions_gradient_for_sac():

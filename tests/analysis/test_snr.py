@@ -7,10 +7,12 @@ import csv
 
 import numpy as np
 import pytest
+import stable_baselines3
 import torch as th
 from stable_baselines3.common.buffers import ReplayBufferSamples
 from support import make
 
+import sb3_sparse
 from sb3_sparse import SparsityCallback
 from sb3_sparse.analysis import GradientSNRCallback, PlasticityCallback, gradient_snr
 from sb3_sparse.analysis.batches import own_randomness, sample_batch
@@ -142,11 +144,12 @@ def test_measuring_leaves_no_trace(name, policy):
 
 
 @pytest.mark.parametrize("compute", ["masked", "sparse"])
+@pytest.mark.parametrize("package", [stable_baselines3, sb3_sparse])
 @pytest.mark.parametrize("name", STILL)
-def test_training_is_the_same_with_and_without(name, compute, tmp_path):
+def test_training_is_the_same_with_and_without(name, package, compute, tmp_path):
     ends = []
     for watched in (False, True):
-        model = make(name, policy_kwargs={"compute": compute})
+        model = make(getattr(package, name), policy_kwargs={"compute": compute})
         callbacks = [SparsityCallback("rigl", update_interval=10)]
         if watched:
             callbacks.append(GradientSNRCallback(32, path=tmp_path / "snr.csv"))
