@@ -1,5 +1,8 @@
 """``learn()`` from end to end: stock SB3, this package, and SBX, which is SB3 in JAX.
 
+This package has two ways: "ours" is its algorithms (``from sb3_sparse import SAC``), "plug-in" is stock
+SB3's with its policy. TQC, QRDQN, CrossQ and TRPO have the second only.
+
 Every contender lives in a process of its own. All share one core and one thread, learn in turn, a
 few seconds a round, and are past the steps at which learning starts and SBX compiles. A second is
 one that the process had the core: on an idle core that is the clock's, and what other programs take
@@ -14,7 +17,7 @@ two layers, or ``nature`` or ``impala`` for images of noise. Hyperparameters are
 except that ``dqn`` takes a gradient step of 128 samples at every step of the environment; ``dqn4``
 takes one of 32 samples at every fourth, which is SB3's default.
 
-    python benchmarks/end_to_end.py                                   # half an hour
+    python benchmarks/end_to_end.py                                   # three quarters of an hour
     python benchmarks/end_to_end.py --cases sac-256,ppo-64@CartPole-v1 --sparsity 0,0.9,0.95
     python benchmarks/end_to_end.py --cases sac-128 --activation elu --method rigl
     python benchmarks/end_to_end.py --sbx sbx/bin/python              # SBX too
@@ -33,12 +36,13 @@ import csv
 import os
 import subprocess
 import sys
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from statistics import median
 from typing import Any
 
-from learner import ACTIVATIONS, ALGORITHMS, IMAGES, Worker
+from learner import ACTIVATIONS, ALGORITHMS, IMAGES, SPARSE, Worker
 from rounds import appending, in_turn, listed
 
 SBX = 'python -m venv sbx && sbx/bin/pip install sbx-rl "gymnasium[mujoco]"'
@@ -93,14 +97,21 @@ def parsed(case: str) -> tuple[str, str, str]:
 def measure(
     plan: tuple[str, str | None, list[float]], workers: dict[str, Worker], args: argparse.Namespace
 ) -> list[dict[str, Any]]:
-    """Rows of the CSV file: stock first, then ours by sparsity, then SBX if it has such a case."""
+    """Rows of the CSV file: stock, then the plug-in and ours by sparsity, then SBX.
+
+    Ours and SBX are left out where they have no such case.
+    """
     case, activation, sparsities = plan
     algo, net, env = parsed(case)
     rollout = 256 if args.grid else 2048
     shared = dict(algo=algo, net=net, env=env, activation=activation, rollout=rollout)
     stock: dict[str, Any] = {"contender": "stock", "sparsity": ""}
     contenders = [stock]
-    contenders += [{"contender": "ours", "sparsity": sparsity} for sparsity in sparsities]
+    contenders += [
+        {"contender": kind, "sparsity": sparsity}
+        for sparsity in sparsities
+        for kind in ("plug-in", "ours")
+    ]
     contenders += [{"contender": "sbx", "sparsity": ""}] if "sbx" in workers else []
     asked = {f"{who['contender']} {who['sparsity']}".strip(): who for who in contenders}
     made = set()
@@ -160,15 +171,20 @@ def summary(rounds: list[dict[str, float]], stock: list[dict[str, float]]) -> di
     }
 
 
+def kind_of(row: Mapping[str, Any]) -> str:
+    """The contender of a row, without the method that moves its masks."""
+    return str(row["contender"]).partition(",")[0]
+
+
 def line(row: dict[str, Any]) -> str:
-    """A row for people; ours is flagged where it is slower than stock."""
+    """A row for people; this package is flagged where it is slower than stock."""
     name = row["contender"] + (f" {row['sparsity']:.0%}" if row["sparsity"] != "" else "")
     where = f"{row['case']} {row['activation']}"
     flag = "" if row["core_share"] > 0.95 else f"  had {row['core_share']:.0%} of the core"
-    if row["contender"].startswith("ours") and row["ratio"] < 1:
+    if kind_of(row) in SPARSE and row["ratio"] < 1:
         flag += "  SLOWER" if row["ratio_highest"] < 1 else "  slower in the median"
     return (
-        f"{where:<22} {row['env']:<15} {name:<9} {row['steps_per_second']:8.1f} steps/s "
+        f"{where:<22} {row['env']:<15} {name:<11} {row['steps_per_second']:8.1f} steps/s "
         f"({row['lowest']:.1f} to {row['highest']:.1f}), {row['ratio']:.2f} of stock "
         f"({row['ratio_lowest']:.2f} to {row['ratio_highest']:.2f}); rollout "
         f"{row['rollout_us']:.0f} us ({row['rollout_ratio']:.2f}), action {row['act_us']:.0f} us "
@@ -177,12 +193,17 @@ def line(row: dict[str, Any]) -> str:
 
 
 def table(path: Path) -> None:
-    """Print what a CSV file holds as Markdown: a line for each case and sparsity."""
-    found: dict[tuple[str, ...], dict[tuple[str, str], dict[str, str]]] = {}
+    """Print what a CSV file holds as Markdown: a line for each case, sparsity and method.
+
+    Parts of a step are those of ours, or of the plug-in where ours is not there.
+    """
+    found: dict[tuple[str, ...], dict[str, dict[str, dict[str, str]]]] = {}
     with path.open(newline="") as file:
         for row in csv.DictReader(file):
             key = (row["case"].partition("@")[0], row["env"], row["activation"])
-            found.setdefault(key, {})[row["contender"], row["sparsity"]] = row
+            how = row["contender"].removeprefix(kind_of(row))
+            shown = f"{float(row['sparsity']):.0%}{how}" if row["sparsity"] else ""
+            found.setdefault(key, {}).setdefault(shown, {})[kind_of(row)] = row
 
     def rates(row: dict[str, str] | None) -> str:
         if row is None:
@@ -190,25 +211,28 @@ def table(path: Path) -> None:
         numbers = [float(row[name]) for name in ("steps_per_second", "lowest", "highest")]
         return "{} ({} to {})".format(*(f"{number:.4g}" for number in numbers))
 
+    def ratio(row: dict[str, str] | None) -> str:
+        return "" if row is None else f"{float(row['ratio']):.2f}"
+
     print(
-        "| case | environment | sparsity | stock, steps/s | SBX | ours | SBX / stock "
-        "| ours / stock | rollout part, us: stock, ours, ratio | action, us: stock, ours, ratio |"
+        "| case | environment | sparsity | stock, steps/s | SBX | plug-in | ours | SBX / stock "
+        "| plug-in / stock | ours / stock | rollout part, us: stock, sparse, ratio "
+        "| action, us: stock, sparse, ratio |"
     )
-    print("|---" * 10 + "|")
-    for (case, env, activation), rows in found.items():
-        stock, sbx = rows["stock", ""], rows.get(("sbx", ""))
-        for (contender, sparsity), ours in rows.items():
-            if contender in ("stock", "sbx"):
-                continue
-            cells = [f"{case} {activation}".strip(), env, f"{float(sparsity):.0%}"]
-            if contender != "ours":
-                cells[2] += contender.removeprefix("ours")
-            cells += [rates(stock), rates(sbx), rates(ours)]
-            cells.append(f"{float(sbx['ratio']):.2f}" if sbx else "")
-            cells.append(f"**{float(ours['ratio']):.2f}**")
+    print("|---" * 12 + "|")
+    for (case, env, activation), by_sparsity in found.items():
+        dense = by_sparsity.pop("")
+        stock, sbx = dense["stock"], dense.get("sbx")
+        for shown, rows in by_sparsity.items():
+            plugin, ours = rows.get("plug-in"), rows.get("ours")
+            cells = [f"{case} {activation}".strip(), env, shown]
+            cells += map(rates, (stock, sbx, plugin, ours))
+            cells += [ratio(sbx), ratio(plugin), f"**{ratio(ours)}**" if ours else ""]
+            sparse = ours or plugin
+            assert sparse is not None
             for part in ("rollout", "act"):
-                both = [f"{float(row[f'{part}_us']):.0f}" for row in (stock, ours)]
-                cells.append(", ".join([*both, f"{float(ours[f'{part}_ratio']):.2f}"]))
+                both = [f"{float(row[f'{part}_us']):.0f}" for row in (stock, sparse)]
+                cells.append(", ".join([*both, f"{float(sparse[f'{part}_ratio']):.2f}"]))
             print("| " + " | ".join(cells) + " |")
 
 
@@ -229,7 +253,7 @@ def arguments() -> tuple[argparse.Namespace, list[tuple[str, str | None, list[fl
     """What was asked for, and what is to be measured: case, activation, sparsities."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--cases", type=listed(str), help=f"default {','.join(CASES)}")
-    parser.add_argument("--sparsity", type=listed(float), help="of ours (default by case)")
+    parser.add_argument("--sparsity", type=listed(float), help="default by case")
     parser.add_argument("--activation", type=listed(str), help="default: SB3's")
     parser.add_argument(
         "--method", choices=["set", "rigl"], help="move masks, every 100 gradient steps"
@@ -283,7 +307,7 @@ def main() -> None:
         return
     if args.core is not None:
         os.sched_setaffinity(0, {args.core})  # the workers inherit it
-    pythons = {"stock": sys.executable, "ours": sys.executable}
+    pythons = dict.fromkeys(("stock", *sorted(SPARSE)), sys.executable)
     if args.sbx is not None:
         pythons["sbx"] = args.sbx
     workers = {kind: Worker(python) for kind, python in pythons.items()}
@@ -291,7 +315,7 @@ def main() -> None:
     with appending(args.csv, FIELDS) as write:
         for part in plan:
             for row in measure(part, workers, args):
-                if row["contender"] == "ours":
+                if row["contender"] in SPARSE:
                     row["contender"] += f", {args.method}" if args.method else ""
                     ours.append(line(row))
                 write(row)

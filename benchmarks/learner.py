@@ -44,10 +44,20 @@ IMAGES = {"nature", "impala"}
 """Networks that take images, from an environment of noise."""
 
 
+MODULES = {
+    "stock": ["stable_baselines3", "sb3_contrib"],
+    "plug-in": ["stable_baselines3", "sb3_contrib"],
+    "ours": ["sb3_sparse"],
+    "sbx": ["sbx"],
+}
+"""Where each contender has its algorithms."""
+SPARSE = {"plug-in", "ours"}
+"""Contenders that take ``SparsePolicy``."""
+
+
 def algorithm(kind: str, name: str) -> Any:
-    """The class from SBX, SB3 or sb3-contrib; None where there is none."""
-    modules = ["sbx"] if kind == "sbx" else ["stable_baselines3", "sb3_contrib"]
-    for module in modules:
+    """A contender's class; None where there is none."""
+    for module in MODULES[kind]:
         try:
             found = getattr(importlib.import_module(module), name, None)
         except ModuleNotFoundError as error:
@@ -82,18 +92,18 @@ def network(kind: str, net: str, activation: str | None) -> dict[str, Any]:
 
 
 def build(spec: dict[str, Any]) -> Any:
-    """A model that has not trained yet; None if SBX has none of this kind."""
+    """A model that has not trained yet; None if we or SBX have none of this kind."""
     kind, net = spec["kind"], spec["net"]
     name, settings = ALGORITHMS[spec["algo"]]
     made = algorithm(kind, name)
     images = net in IMAGES
     policy = "CnnPolicy" if images else "MlpPolicy"
     if made is None or policy not in made.policy_aliases or (kind == "sbx" and net == "impala"):
-        if kind == "sbx":
+        if kind in ("ours", "sbx"):
             return None
         raise SystemExit(f"{name} is not installed here; TQC and others need sb3-contrib")
     kwargs = network(kind, net, spec["activation"])
-    if kind == "ours":
+    if kind in SPARSE:
         importlib.import_module("sb3_sparse")  # registers SparsePolicy
         policy, kwargs = "SparsePolicy", dict(kwargs, sparsity=spec["sparsity"])
     settings = dict(settings)
@@ -135,16 +145,20 @@ class Learner:
     def __init__(self, spec: dict[str, Any], model: Any) -> None:
         self.model, self.train, self.act = model, Meter(), Meter()
         self.callback = None
-        if spec["kind"] == "ours" and spec["method"]:
+        if spec["kind"] in SPARSE and spec["method"]:
             from sb3_sparse import SparsityCallback
 
             self.callback = SparsityCallback(spec["method"], update_interval=100, end=1.0)
         model.train = self.train.around(model.train)
         if hasattr(model, "replay_buffer"):
             model.predict = self.act.around(model.predict)
+        elif spec["kind"] == "sbx":
+            model.policy.predict_all = self.act.around(model.policy.predict_all)
         else:
-            name = "predict_all" if spec["kind"] == "sbx" else "forward"
-            setattr(model.policy, name, self.act.around(getattr(model.policy, name)))
+            # Not on the policy itself: one that somebody has patched trains by its modules.
+            cls = type(model.policy)
+            own = {"forward": self.act.around(cls.forward), "__module__": cls.__module__}
+            model.policy.__class__ = type(cls.__name__, (cls,), own)
         model.learn(getattr(model, "learning_starts", 0) + 20)  # SBX compiles here
 
     def learn(self, steps: int) -> dict[str, float]:

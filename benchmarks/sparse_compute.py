@@ -29,7 +29,7 @@ import torch as th
 from gymnasium import spaces
 from random_env import TORQUES, VECTOR, RandomEnv
 from rounds import appending, interleaved, listed
-from stable_baselines3 import DQN, SAC, TD3
+from stable_baselines3 import DQN, PPO, SAC, TD3
 from step_overhead import fused_like_stock, off_policy, on_policy
 from torch.nn import functional
 
@@ -159,15 +159,14 @@ ALGOS = {
     "SAC": (SAC, RandomEnv(VECTOR, TORQUES), 256),
     "TD3": (TD3, RandomEnv(VECTOR, TORQUES), 256),
     "DQN": (DQN, RandomEnv(VECTOR, spaces.Discrete(4)), 128),
-    "PPO": (None, RandomEnv(VECTOR, TORQUES), 64),
+    "PPO": (PPO, RandomEnv(VECTOR, TORQUES), 64),
 }
 
 
 def maker(algo: str, widths: list[int], steps: int) -> Callable[..., Variant]:
     kind, env, batch = ALGOS[algo]
-    if kind is None:
-        make = on_policy(env, batch, batch * steps)
-        return lambda policy, kwargs: make(policy, dict(kwargs, net_arch=widths))
+    if kind is PPO:
+        return on_policy(kind, env, batch, batch * steps, net_arch=widths)
     return off_policy(kind, env, batch, steps, net_arch=widths)
 
 

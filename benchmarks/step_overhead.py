@@ -42,13 +42,13 @@ def off_policy(algo: Any, env: gym.Env, batch: int, steps: int, **settings: Any)
     return make
 
 
-def on_policy(env: gym.Env, batch: int, rollout: int) -> Callable:
+def on_policy(algo: Any, env: gym.Env, batch: int, rollout: int, **settings: Any) -> Callable:
     """The same for PPO: one call is an epoch over a rollout."""
 
     def make(policy: str, policy_kwargs: dict[str, Any]) -> tuple[Any, Callable[[], None], int]:
-        model = PPO(
+        model = algo(
             policy, env, seed=0, n_steps=rollout, batch_size=batch, n_epochs=1,
-            policy_kwargs=policy_kwargs,
+            policy_kwargs={**settings, **policy_kwargs},
         )  # fmt: skip
         model.learn(rollout)
         return model, model.train, rollout // batch
@@ -63,7 +63,7 @@ CASES: dict[str, tuple[Callable, str, float]] = {
         "Mlp",
         0.90,
     ),
-    "PPO 64x64 batch 64": (on_policy(RandomEnv(VECTOR, TORQUES), 64, 2048), "Mlp", 0.90),
+    "PPO 64x64 batch 64": (on_policy(PPO, RandomEnv(VECTOR, TORQUES), 64, 2048), "Mlp", 0.90),
     "DQN Nature CNN batch 32": (
         off_policy(DQN, RandomEnv(IMAGE, spaces.Discrete(6)), 32, 5),
         "Cnn",

@@ -12,11 +12,10 @@ from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
-from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_sparse import SparsePolicy, SparsityCallback
+from sb3_sparse import PPO, SparsityCallback
 from sb3_sparse.export import export, record_observations
 
 
@@ -60,7 +59,7 @@ def main() -> None:
     env_id = "Pendulum-v1"
     env = VecNormalize(make_vec_env(env_id, n_envs=4, seed=0), gamma=0.9)
     settings = dict(n_steps=1024, gamma=0.9, gae_lambda=0.95, learning_rate=1e-3, seed=0)
-    model = PPO(SparsePolicy, env, policy_kwargs=dict(sparsity=0.8), **settings)
+    model = PPO("SparsePolicy", env, policy_kwargs=dict(sparsity=0.8), **settings)
     model.learn(args.steps, callback=SparsityCallback("rigl", update_interval=100))
     print(model.policy.sparsity_report())
 

@@ -7,10 +7,9 @@ import argparse
 import tempfile
 from pathlib import Path
 
-from stable_baselines3 import DQN
 from stable_baselines3.common.evaluation import evaluate_policy
 
-from sb3_sparse import SparsePolicy, SparsityCallback
+from sb3_sparse import DQN, SparsityCallback
 
 
 def main() -> None:
@@ -19,7 +18,7 @@ def main() -> None:
     args = parser.parse_args()
 
     model = DQN(
-        SparsePolicy,
+        "SparsePolicy",
         "CartPole-v1",
         learning_rate=2.3e-3,
         batch_size=64,

@@ -5,11 +5,10 @@ python examples/ppo_pruning.py
 
 import argparse
 
-from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 
-from sb3_sparse import SparsePolicy, SparsityCallback
+from sb3_sparse import PPO, SparsityCallback
 
 
 def main() -> None:
@@ -18,7 +17,7 @@ def main() -> None:
     args = parser.parse_args()
 
     model = PPO(
-        SparsePolicy,
+        "SparsePolicy",
         make_vec_env("CartPole-v1", n_envs=8, seed=0),
         n_steps=32,
         batch_size=256,

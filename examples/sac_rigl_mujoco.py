@@ -5,10 +5,9 @@ python examples/sac_rigl_mujoco.py --steps 1000000
 
 import argparse
 
-from stable_baselines3 import SAC
 from stable_baselines3.common.evaluation import evaluate_policy
 
-from sb3_sparse import SparsePolicy, SparsityCallback
+from sb3_sparse import SAC, SparsityCallback
 
 
 def main() -> None:
@@ -18,7 +17,7 @@ def main() -> None:
     args = parser.parse_args()
 
     model = SAC(
-        SparsePolicy,
+        "SparsePolicy",
         args.env,
         learning_starts=min(10_000, args.steps // 10),
         policy_kwargs=dict(sparsity=0.9, weight_decay=1e-6),

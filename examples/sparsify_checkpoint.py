@@ -9,11 +9,10 @@ import argparse
 import tempfile
 from pathlib import Path
 
-from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 
-from sb3_sparse import sparsify
+from sb3_sparse import PPO, sparsify
 
 
 def main() -> None:

@@ -36,6 +36,7 @@ def test_train_says_what_it_does_and_enjoy_and_inspect_read_it(tmp_path):
     done = sb3_sparse("train", "-n", "1500", "--seed", "3", *evaluation, *QUICK, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "Training DQN on CartPole-v1, rigl at 90% (ERK), seed 3" in done.stdout
+    assert "\nGradient steps: fused\n" in done.stdout
     assert re.search(
         r"1500 of 1500 steps, return \d+\.\d, sparsity 8\d\.\d\d%, \d+ steps a second", done.stdout
     )

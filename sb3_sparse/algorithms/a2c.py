@@ -23,7 +23,8 @@ class A2C(OnPolicy, stable_baselines3.A2C):
             self._not_covered(why)
             super().train()
 
-    def _machine(self) -> Machine:
+    def _next_machine(self) -> Machine:
+        self._trains().begin(self.policy, METHODS)
         batch = self.rollout_buffer.buffer_size * self.rollout_buffer.n_envs
         key = (self.normalize_advantage,)
         return self._trains().machine(key, batch, [self.policy.optimizer], self._record)
@@ -51,8 +52,7 @@ class A2C(OnPolicy, stable_baselines3.A2C):
     def _train_fused(self) -> None:
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
-        self._trains().begin(self.policy, METHODS)
-        machine = self._machine()
+        machine = self._next_machine()
         machine.set(
             {
                 "ent_coef": self.ent_coef,

@@ -27,6 +27,10 @@ class DQN(OffPolicy, stable_baselines3.DQN):
             self._not_covered(why)
             super().train(gradient_steps, batch_size)
 
+    def _next_machine(self) -> Machine:
+        self._trains().begin(self.policy, METHODS)
+        return self._machine(self.batch_size, self._find_source())
+
     def _machine(self, batch_size: int, source: str) -> Machine:
         return self._trains().machine(
             (source,), batch_size, [self.policy.optimizer],

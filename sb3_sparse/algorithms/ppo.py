@@ -40,6 +40,11 @@ class PPO(OnPolicy, stable_baselines3.PPO):
             self._not_covered(why)
             super().train()
 
+    def _next_machine(self) -> Machine:
+        self._trains().begin(self.policy, METHODS)
+        total = self.rollout_buffer.buffer_size * self.rollout_buffer.n_envs
+        return self._machine(min(self.batch_size, total))
+
     def _machine(self, batch: int) -> Machine:
         normalised = self.normalize_advantage and batch > 1
         clipped = self.clip_range_vf is not None
@@ -90,9 +95,7 @@ class PPO(OnPolicy, stable_baselines3.PPO):
         }
         if self.clip_range_vf is not None:
             settings["clip_range_vf"] = self.clip_range_vf(remaining)  # type: ignore[operator]
-        total = self.rollout_buffer.buffer_size * self.rollout_buffer.n_envs
-        self._trains().begin(self.policy, METHODS)
-        self._machine(min(self.batch_size, total))  # before anything is drawn
+        self._next_machine()  # before anything is drawn
 
         logged = defaultdict(list)
         going_on = True

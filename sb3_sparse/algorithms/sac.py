@@ -39,6 +39,20 @@ class SAC(OffPolicy, stable_baselines3.SAC):
         optimizers = [self.actor.optimizer, self.critic.optimizer]
         return optimizers + ([self.ent_coef_optimizer] if self.ent_coef_optimizer else [])
 
+    def _begin(self) -> None:
+        """Look at the model before a round of gradient steps.
+
+        :raises NotCovered: if they are SB3's own
+        """
+        own = () if self.log_ent_coef is None else (self.log_ent_coef,)
+        self._trains().begin(self.policy, METHODS, own)
+        if self.tau >= 1:
+            raise NotCovered("targets that are copies")
+
+    def _next_machine(self) -> Machine:
+        self._begin()
+        return self._machine(self.batch_size, self._find_source())
+
     def _machine(self, batch_size: int, source: str) -> Machine:
         return self._trains().machine(
             (self.tau, source), batch_size, self._optimizers(),
@@ -102,10 +116,7 @@ class SAC(OffPolicy, stable_baselines3.SAC):
     def _train_fused(self, gradient_steps: int, batch_size: int) -> None:
         self.policy.set_training_mode(True)
         self._update_learning_rate(self._optimizers())
-        own = () if self.log_ent_coef is None else (self.log_ent_coef,)
-        self._trains().begin(self.policy, METHODS, own)
-        if self.tau >= 1:
-            raise NotCovered("targets that are copies")
+        self._begin()
         source = self._find_source()
         logged: dict[str, list[float]] = {}
         for step in range(gradient_steps):

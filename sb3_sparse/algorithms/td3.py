@@ -32,6 +32,19 @@ class TD3(OffPolicy, stable_baselines3.TD3):
             self._not_covered(why)
             super().train(gradient_steps, batch_size)
 
+    def _begin(self) -> None:
+        """Look at the model before a round of gradient steps.
+
+        :raises NotCovered: if they are SB3's own
+        """
+        self._trains().begin(self.policy, METHODS)
+        if self.tau >= 1:
+            raise NotCovered("targets that are copies")
+
+    def _next_machine(self) -> Machine:
+        self._begin()
+        return self._machine(self.batch_size, self._find_source(), True)
+
     def _machine(self, batch_size: int, source: str, delayed: bool) -> Machine:
         optimizers = [self.critic.optimizer, self.actor.optimizer]
         return self._trains().machine(
@@ -71,9 +84,7 @@ class TD3(OffPolicy, stable_baselines3.TD3):
     def _train_fused(self, gradient_steps: int, batch_size: int) -> None:
         self.policy.set_training_mode(True)
         self._update_learning_rate([self.actor.optimizer, self.critic.optimizer])
-        self._trains().begin(self.policy, METHODS)
-        if self.tau >= 1:
-            raise NotCovered("targets that are copies")
+        self._begin()
         source = self._find_source()
         actor_losses, critic_losses = [], []
         for _ in range(gradient_steps):

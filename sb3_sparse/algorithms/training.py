@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from itertools import chain
 from operator import attrgetter, itemgetter
@@ -23,6 +24,7 @@ from sb3_sparse.engine.watch import Watch, patched
 from sb3_sparse.fused.errors import NotCovered
 from sb3_sparse.fused.machine import Machine
 from sb3_sparse.fused.program import Parts, Program
+from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.policies.mixin import SparsePolicyMixin
 from sb3_sparse.policies.shortcut import takes_vectors, untouched
 from sb3_sparse.policies.storage import KNOWN
@@ -70,6 +72,8 @@ class Training:
         :param others: parameters that are trained beside the policy's
         :raises NotCovered: if somebody would notice, or miss, that SB3 does not call them
         """
+        if unwrapped(policy) is not policy:
+            raise NotCovered("the policy is compiled")
         if not isinstance(policy, SparsePolicyMixin):
             raise NotCovered(f"the policy, {type(policy).__name__}, is not sparse")
         settings = self._settings_now()
@@ -232,10 +236,33 @@ class Fused(BaseAlgorithm):
             training = self._training = Training()
         return training
 
+    @abstractmethod
+    def _next_machine(self) -> Machine:
+        """What would run the next gradient step.
+
+        :raises NotCovered: if programs cannot compute it
+        """
+
+    def why_not_fused(self) -> str | None:
+        """Why gradient steps are Stable-Baselines3's own; None: they are fused.
+
+        It is found out by recording one, as the model is now, without running it: some
+        milliseconds, once. ::
+
+            model = SAC("SparsePolicy", env, use_sde=True, policy_kwargs=dict(sparsity=0.9))
+            model.why_not_fused()  # 'gSDE'
+        """
+        try:
+            self._next_machine()
+        except NotCovered as why:
+            return str(why)
+        return None
+
     def _not_covered(self, why: NotCovered) -> None:
-        """Say once why gradient steps are SB3's own."""
+        """Let the log say once why gradient steps are SB3's own, where the policy is sparse."""
         training = self._trains()
         training.reason = reason = str(why)
         if reason not in training.said:
             training.said.add(reason)
-            self.logger.debug(f"gradient steps are not fused: {why}")
+            if isinstance(unwrapped(self.policy), SparsePolicyMixin):
+                self.logger.info(f"Gradient steps are Stable-Baselines3's own: {why}")

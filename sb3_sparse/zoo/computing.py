@@ -12,13 +12,19 @@ from pathlib import Path
 from typing import Any
 
 import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
 
+from sb3_sparse.algorithms.training import Fused
 from sb3_sparse.engine.native.library import in_use, why_missing
 from sb3_sparse.errors import CorruptStateError
 from sb3_sparse.loading.guard import reading
+from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.policies.mixin import SparsePolicyMixin
 from sb3_sparse.policies.report import COMPUTES, NON_ZEROS
 from sb3_sparse.zoo.record import CURE, NAME, WHAT
+
+FUSED, OWN = "fused", "SB3's own"
+"""Ways in which gradient steps run."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +36,7 @@ class Sitting:
     :param torch_instructions: instruction set of torch's own kernels
     :param threads: of torch, and so of the kernels
     :param layers: how each layer computed when it began, by name
+    :param gradient_steps: how they ran when it began, as :func:`gradient_steps_of` says it
     """
 
     num_timesteps: int
@@ -37,6 +44,7 @@ class Sitting:
     torch_instructions: str
     threads: int
     layers: Mapping[str, str]
+    gradient_steps: str = OWN  # as in records that say nothing of it
 
     def __str__(self) -> str:
         compact = sum(how == NON_ZEROS for how in self.layers.values())
@@ -44,7 +52,8 @@ class Sitting:
         threads = "1 thread" if self.threads == 1 else f"{self.threads} threads"
         return (
             f"from step {self.num_timesteps}: {compact} of {len(self.layers)} layers on non-zeros, "
-            f"{kernels}, torch's {self.torch_instructions}, {threads}"
+            f"{kernels}, torch's {self.torch_instructions}, {threads}, gradient steps "
+            f"{self.gradient_steps}"
         )
 
 
@@ -60,28 +69,37 @@ class Computing:
     sittings: tuple[Sitting, ...]
 
 
-def computing_at(
-    policy: SparsePolicyMixin, num_timesteps: int, record: Mapping[str, Any], folder: Path
-) -> dict[str, Any]:
+def gradient_steps_of(model: BaseAlgorithm) -> str:
+    """How a model's gradient steps run: ``"fused"``, or ``"SB3's own"`` and why."""
+    if not isinstance(model, Fused):
+        return f"{OWN}: {type(model).__name__} has no others"
+    why = model.why_not_fused()
+    return FUSED if why is None else f"{OWN}: {why}"
+
+
+def computing_at(model: BaseAlgorithm, record: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """What a run's record shall say of how it computes, when a sitting begins.
 
-    A sitting that began at this step or later is not part of the run: it was killed before its
-    first checkpoint.
+    A sitting that began at the model's step or later is not part of the run: it was killed before
+    its first checkpoint.
 
-    :param num_timesteps: environment steps that are done
+    :param model: with a sparse policy
     :param record: what the run's record says so far
     :param folder: of the run
     """
+    policy = unwrapped(model.policy)
+    assert isinstance(policy, SparsePolicyMixin)
     known = computing_in(record, folder)
     now = Sitting(
-        num_timesteps,
+        model.num_timesteps,
         None if why_missing() else in_use(),
         th.backends.cpu.get_cpu_capability(),
         th.get_num_threads(),
         {layer.name: layer.compute for layer in policy.sparsity_report().layers},
+        gradient_steps_of(model),
     )
     before = () if known is None else known.sittings
-    earlier = [one for one in before if one.num_timesteps < num_timesteps]
+    earlier = [one for one in before if one.num_timesteps < model.num_timesteps]
     return asdict(Computing(policy.sparsity_config.compute, (*earlier, now)))
 
 
@@ -100,6 +118,8 @@ def computing_in(record: Mapping[str, Any], folder: Path) -> Computing | None:
             _check(one.layers)
             if type(one.num_timesteps) is not int:
                 raise CorruptStateError(f"a sitting began at step {one.num_timesteps!r}")
+            if not isinstance(one.gradient_steps, str):
+                raise CorruptStateError(f"its gradient steps were {one.gradient_steps!r}")
         return Computing(str(found["asked"]), sittings)
 
 

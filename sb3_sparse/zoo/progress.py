@@ -19,6 +19,7 @@ from rich.progress import (
 
 from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.policies.mixin import SparsePolicyMixin
+from sb3_sparse.zoo.computing import gradient_steps_of
 from sb3_sparse.zoo.match import Match
 from sb3_sparse.zoo.watch import Watch
 
@@ -112,6 +113,7 @@ class TrainingProgress(Watch):
             compact = [layer.compact for layer in policy.sparse.layers]
             if any(compact):
                 self.console.print(f"{sum(compact)} of {len(compact)} layers compute on non-zeros")
+        self.console.print(f"Gradient steps: {gradient_steps_of(self.model)}", soft_wrap=True)
         self.task = self.progress.add_task("", total=self.planned, status=self._status())
         self.progress.start()
 

@@ -187,7 +187,7 @@ def _learn(
     status = "running" if done < planned else "evaluating"
     state: dict[str, Any] = {"device": str(model.device), "error": None}
     if status == "running":
-        state["computing"] = computing_at(policy, done, read_record(folder), folder)
+        state["computing"] = computing_at(model, read_record(folder), folder)
     write_record(folder, status=status, num_timesteps=done, **state, **sparsity_of(policy))
     try:
         if done < planned:

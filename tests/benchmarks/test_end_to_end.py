@@ -35,14 +35,15 @@ def test_a_case_is_measured_from_end_to_end(tmp_path):
     case = ["--cases", "a2c-8@CartPole-v1", "--activation", "silu", "--sparsity", 0.5]
     done = run(*case, *one_round, "--csv", file)
     assert done.returncode == 0, done.stderr
-    assert " of 1 slower than stock" in done.stdout
+    assert " of 2 slower than stock" in done.stdout
     with file.open(newline="") as rows:
-        stock, ours = csv.DictReader(rows)
-    assert [stock["contender"], ours["contender"], ours["sparsity"]] == ["stock", "ours", "0.5"]
+        stock, plugin, ours = csv.DictReader(rows)
+    assert [row["contender"] for row in (stock, plugin, ours)] == ["stock", "plug-in", "ours"]
+    assert [row["sparsity"] for row in (stock, plugin, ours)] == ["", "0.5", "0.5"]
     assert float(stock["ratio"]) == 1
-    assert int(stock["steps"]) == int(ours["steps"])
+    assert int(stock["steps"]) == int(plugin["steps"]) == int(ours["steps"])
     assert int(stock["steps"]) >= 10
-    for row in (stock, ours):
+    for row in (stock, plugin, ours):
         step = 1e6 / float(row["steps_per_second"])
         assert 0 < float(row["act_us"]) < float(row["rollout_us"]) < step
     rates = float(ours["steps_per_second"]) / float(stock["steps_per_second"])
@@ -50,7 +51,55 @@ def test_a_case_is_measured_from_end_to_end(tmp_path):
     printed = run("--table", file).stdout.splitlines()
     assert len(printed) == 3
     assert printed[2].startswith("| a2c-8 silu | CartPole-v1 | 50% | ")
-    assert f" | **{float(ours['ratio']):.2f}** | " in printed[2]
+    ratios = f" | {float(plugin['ratio']):.2f} | **{float(ours['ratio']):.2f}** | "
+    assert ratios in printed[2]
+
+
+def test_the_table_has_a_line_for_each_sparsity_and_method(end_to_end, capsys, tmp_path):
+    row = dict.fromkeys(end_to_end.FIELDS, 1.0) | dict(env="E-v0", activation="")
+    rows = [
+        dict(row, case="tqc-8@E-v0", contender="stock", sparsity=""),
+        dict(row, case="tqc-8@E-v0", contender="plug-in, rigl", sparsity=0.9, ratio=2.0),
+        dict(row, case="sac-8", contender="stock", sparsity=""),
+        dict(row, case="sac-8", contender="sbx", sparsity="", ratio=1.5),
+        dict(row, case="sac-8", contender="plug-in", sparsity=0.9, ratio=2.0),
+        dict(row, case="sac-8", contender="ours", sparsity=0.9, ratio=4.0, rollout_us=3.0),
+        dict(row, case="sac-8", contender="ours", sparsity=0.0, ratio=1.25),
+    ]
+    path = tmp_path / "rows.csv"
+    with end_to_end.appending(path, end_to_end.FIELDS) as write:
+        for one in rows:
+            write(one)
+    end_to_end.table(path)
+    rate, same = "1 (1 to 1)", "1, 1, 1.00"
+    assert capsys.readouterr().out.splitlines()[2:] == [
+        f"| tqc-8 | E-v0 | 90%, rigl | {rate} |  | {rate} |  |  | 2.00 |  | {same} | {same} |",
+        f"| sac-8 | E-v0 | 90% | {rate} | {rate} | {rate} | {rate} | 1.50 | 2.00 | **4.00** "
+        f"| 1, 3, 1.00 | {same} |",
+        f"| sac-8 | E-v0 | 0% | {rate} | {rate} |  | {rate} | 1.50 |  | **1.25** "
+        f"| {same} | {same} |",
+    ]
+
+
+@pytest.mark.parametrize("algo", ["ppo", "a2c", "sac", "dqn"])
+def test_our_gradient_steps_are_fused_while_they_are_measured(end_to_end, algo):
+    import learner
+
+    env = "CartPole-v1" if algo == "dqn" else "Pendulum-v1"
+    spec = dict(kind="ours", algo=algo, net="8", env=env, activation=None, rollout=64)
+    spec |= dict(sparsity=0.9, method="rigl")
+    model = learner.build(spec)
+    assert type(model).__module__.startswith("sb3_sparse.")
+    times = learner.Learner(spec, model).learn(64)
+    assert times["train"] > 0 < times["act"]
+    assert model.why_not_fused() is None
+
+
+def test_what_has_no_class_of_ours_is_the_plug_in_alone(end_to_end):
+    import learner
+
+    assert learner.algorithm("ours", "TQC") is None
+    assert learner.algorithm("plug-in", "TQC").__module__.startswith("sb3_contrib.")
 
 
 def test_medians_and_ratios_are_taken_round_by_round(end_to_end):
@@ -82,6 +131,7 @@ def test_medians_and_ratios_are_taken_round_by_round(end_to_end):
     ("contender", "ratio", "highest", "flag"),
     [
         ("ours", 0.9, 0.99, "  SLOWER"),
+        ("plug-in", 0.9, 0.99, "  SLOWER"),
         ("ours, rigl", 0.9, 1.1, "  slower in the median"),
         ("ours", 1.0, 1.1, ""),
         ("sbx", 0.9, 0.99, ""),

@@ -10,10 +10,18 @@ from pathlib import Path
 import pytest
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
+from support import make
 
+import sb3_sparse
 from sb3_sparse.engine.native import library
 from sb3_sparse.errors import CorruptStateError
-from sb3_sparse.zoo.computing import Computing, Sitting, computing_at, computing_in
+from sb3_sparse.zoo.computing import (
+    Computing,
+    Sitting,
+    computing_at,
+    computing_in,
+    gradient_steps_of,
+)
 from sb3_sparse.zoo.inspect import inspect_model
 from sb3_sparse.zoo.record import read_record, write_record
 from sb3_sparse.zoo.run import Run
@@ -23,6 +31,11 @@ LARGE = {"net_arch": [200, 200], "batch_size": 16, "learning_starts": 50, "updat
 QUICK = dict(eval_freq=200, eval_episodes=1)
 NAMES = ["q_net.q_net.0", "q_net.q_net.2", "q_net.q_net.4"]
 """4-200-200-2: 40,000 connections in the middle, so one run of layers that may be compact."""
+
+
+SITTING = dict(
+    num_timesteps=0, instructions=None, torch_instructions="", threads=1, layers={},
+)  # fmt: skip
 
 
 class CtrlC(BaseCallback):
@@ -51,7 +64,7 @@ def test_the_record_says_what_was_asked_for_and_what_decides_rounding(trained):
     found = computing_in(read_record(trained), trained)
     compact = dict.fromkeys(NAMES, "non-zeros")
     capability = th.backends.cpu.get_cpu_capability()
-    sitting = Sitting(0, library.in_use(), capability, th.get_num_threads(), compact)
+    sitting = Sitting(0, library.in_use(), capability, th.get_num_threads(), compact, "fused")
     assert found == Computing("auto", (sitting,))
     assert layers_of(trained) == compact
 
@@ -85,10 +98,11 @@ def test_a_run_that_is_gone_on_with_has_a_sitting_more(tmp_path):
 
 
 def test_sittings_that_came_to_nothing_are_forgotten(trained):
-    policy = train(run(), trained.parent.parent).model.policy
+    model = train(run(), trained.parent.parent).model
     record = read_record(trained)
     for steps in (200, 400, 200):
-        record["computing"] = computing_at(policy, steps, record, trained)
+        model.num_timesteps = steps
+        record["computing"] = computing_at(model, record, trained)
     assert [one["num_timesteps"] for one in record["computing"]["sittings"]] == [0, 200]
 
 
@@ -101,7 +115,7 @@ def test_inspect_tells_what_the_record_says_not_what_would_be_chosen_here(
         assert [layer.compute for layer in found.report.layers] == ["non-zeros"] * 3
         assert "The run asked for compute='auto'." in str(found)
         assert f"3 of 3 layers on non-zeros, {library.in_use()} kernels" in str(found)
-        assert str(found).endswith(", 1 thread.")
+        assert str(found).endswith(", 1 thread, gradient steps fused.")
     shutil.copy(trained / "best_model.zip", tmp_path)
     best = inspect_model(tmp_path / "best_model.zip")
     assert best.computing is None
@@ -115,6 +129,12 @@ def record(trained):
     before = path.read_text()
     yield json.loads(before)
     path.write_text(before)
+
+
+def test_gradient_steps_of_older_records_were_sb3s(trained, record):
+    del record["computing"]["sittings"][0]["gradient_steps"]
+    (trained / "sparsity.json").write_text(json.dumps(record))
+    assert str(inspect_model(trained)).endswith(", gradient steps SB3's own.")
 
 
 def test_records_of_older_versions_are_read(trained, record):
@@ -135,9 +155,22 @@ def test_records_of_older_versions_are_read(trained, record):
         {"computing": {"asked": "auto", "sittings": [{"num_timesteps": 0}]}},
         {"layers": [{"name": "q_net.q_net.0", "nnz": 80, "compute": "quickly"}]},
         {"layers": 3},
+        {"computing": {"asked": "auto", "sittings": [{**SITTING, "gradient_steps": 3}]}},
     ],
 )
 def test_a_damaged_record_is_named(trained, record, damage):
     write_record(trained, **damage)
     with pytest.raises(CorruptStateError, match=r"sparsity\.json"):
         inspect_model(trained)
+
+
+@pytest.mark.parametrize(
+    ("make_model", "how"),
+    [
+        (lambda: make(sb3_sparse.SAC), "fused"),
+        (lambda: make(sb3_sparse.SAC, use_sde=True), "SB3's own: gSDE"),
+        (lambda: make("TQC"), "SB3's own: TQC has no others"),
+    ],
+)
+def test_how_gradient_steps_run_is_told_before_they_do(make_model, how):
+    assert gradient_steps_of(make_model()) == how
