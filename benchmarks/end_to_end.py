@@ -1,7 +1,7 @@
 """``learn()`` from end to end: stock SB3, this package, and SBX, which is SB3 in JAX.
 
-This package has two ways: "ours" is its algorithms (``from sb3_sparse import SAC``), "plug-in" is stock
-SB3's with its policy. TQC, QRDQN, CrossQ and TRPO have the second only.
+This package has two ways: "ours" is its algorithms (``from sb3_sparse import SAC``), "plug-in" is
+stock SB3's with its policy. TQC, QRDQN, CrossQ and TRPO have the second only.
 
 Every contender lives in a process of its own. All share one core and one thread, learn in turn, a
 few seconds a round, and are past the steps at which learning starts and SBX compiles. A second is

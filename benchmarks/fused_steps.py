@@ -2,8 +2,8 @@
 
 The three are timed in turn in one process, on one thread; the medians of the ratios, round by
 round, are what counts. "plug-in" is ``stable_baselines3.SAC`` with ``SparsePolicy``, whose step is
-SB3's own; "fused" is ``sb3_sparse.SAC``, whose step is one call of the kernels. Batches are drawn from the
-buffer in all of them, as ``train()`` does.
+SB3's own; "fused" is ``sb3_sparse.SAC``, whose step is one call of the kernels. What is timed is
+``train()``, so each draws its batches from its buffer.
 
     python benchmarks/fused_steps.py                             # two minutes
     python benchmarks/fused_steps.py --cases SAC --sparsity 0.9,0.95,0.99

@@ -87,7 +87,7 @@ def test_our_gradient_steps_are_fused_while_they_are_measured(end_to_end, algo):
 
     env = "CartPole-v1" if algo == "dqn" else "Pendulum-v1"
     spec = dict(kind="ours", algo=algo, net="8", env=env, activation=None, rollout=64)
-    spec |= dict(sparsity=0.9, method="rigl")
+    spec |= dict(sparsity=0.9, method=None)
     model = learner.build(spec)
     assert type(model).__module__.startswith("sb3_sparse.")
     times = learner.Learner(spec, model).learn(64)
