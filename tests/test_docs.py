@@ -7,11 +7,13 @@ import shlex
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from stable_baselines3 import SAC
-from support import assert_masked, make
+import torch as th
+from stable_baselines3 import DQN, SAC
+from support import arguments_of, assert_masked, make
 
 from sb3_sparse import SparsePolicy, cli
 from sb3_sparse.export import export
@@ -62,6 +64,50 @@ def test_the_compact_model_of_the_documents_trains():
     exec(compile(small, "docs/compute.md", "exec"), names)
     assert all(layer.compact for layer in names["model"].policy.sparse.layers)
     names["model"].learn(110)
+
+
+def test_the_fused_model_of_the_documents_trains(capsys):
+    code, _ = python_blocks("docs/gradient_steps.md")
+    small = code.replace("1_000_000", "150").replace("HalfCheetah-v5", "Pendulum-v1")
+    assert small.count("150") == small.count("Pendulum") == 1
+    exec(compile(small, "docs/gradient_steps.md", "exec"), {})
+    assert capsys.readouterr().out.splitlines()[0] == "None"
+
+
+class TorchCQL(DQN):
+    """What the algorithm of the documents computes, with tensors."""
+
+    def train(self, gradient_steps, batch_size=100):
+        self._update_learning_rate(self.policy.optimizer)
+        for _ in range(gradient_steps):
+            data = self.replay_buffer.sample(batch_size)
+            with th.no_grad():
+                next_q = self.q_net_target(data.next_observations).max(dim=1, keepdim=True).values
+                wanted = data.rewards + (1 - data.dones) * self.gamma * next_q
+            q = self.q_net(data.observations)
+            taken = q.gather(1, data.actions)
+            distrust = (q.logsumexp(dim=1, keepdim=True) - taken).mean()
+            loss = th.nn.functional.smooth_l1_loss(taken, wanted) + 0.5 * distrust
+            self.policy.optimizer.zero_grad()
+            loss.backward()
+            th.nn.utils.clip_grad_norm_(self.policy.parameters(), self.max_grad_norm)
+            self.policy.optimizer.step()
+
+
+def test_the_algorithm_of_the_documents_learns_what_it_says():
+    _, code = python_blocks("docs/gradient_steps.md")
+    names: dict[str, Any] = {}
+    exec(compile(code, "docs/gradient_steps.md", "exec"), names)
+    own, expected, plain = (
+        make(cls, "CartPole-v1", **arguments_of(DQN)).learn(50)
+        for cls in (names["CQL"], TorchCQL, DQN)
+    )
+    assert own.why_not_fused() is None
+    weights = expected.policy.state_dict()
+    for key, value in own.policy.state_dict().items():
+        th.testing.assert_close(value, weights[key], rtol=1e-4, atol=1e-6)
+    layer = "q_net.q_net.0.weight"
+    assert not th.allclose(plain.policy.state_dict()[layer], weights[layer], rtol=1e-4)
 
 
 def test_the_measures_of_the_documents_run(tmp_path, monkeypatch, capsys):
