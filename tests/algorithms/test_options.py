@@ -75,7 +75,7 @@ OPTIONS = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("name", "options"), OPTIONS, ids=str)
+@pytest.mark.parametrize(("name", "options"), OPTIONS)
 def test_an_option(name, options):
     kwargs = {key: dict(v) if isinstance(v, dict) else v for key, v in options.items()}
     assert_like_stock(name, **kwargs)
