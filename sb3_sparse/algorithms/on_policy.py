@@ -75,6 +75,9 @@ class OnPolicy(Fused, OnPolicyAlgorithm):
         space = self.action_space
         if isinstance(space, spaces.Box):
             log_std = program.parameter(policy.log_std)
+            program.check(
+                program.constant(0.0) / log_std.exp(), "distribution"
+            )  # a deviation of 0 is none
             actions = program.input("actions", head.features)
             log_prob, entropy = gaussian(head, log_std, actions)
         elif isinstance(space, spaces.Discrete):
@@ -87,6 +90,8 @@ class OnPolicy(Fused, OnPolicyAlgorithm):
             log_prob, entropy = bernoulli(head, program.input("actions", head.features))
         else:
             raise NotCovered(f"actions of type {type(space).__name__}")
+        if isinstance(space, spaces.Discrete | spaces.MultiDiscrete):
+            program.check(log_prob, "distribution")  # of infinite logits
         return values, log_prob, entropy
 
     @staticmethod

@@ -7,6 +7,8 @@ from collections.abc import Sequence
 
 from sb3_sparse.fused.values import Value
 
+LARGEST = 3.4028234663852886e38
+"""Of the numbers of single precision."""
 LOG_OF_ROOT_OF_TWO_PI = 0.5 * math.log(2.0 * math.pi)
 
 
@@ -20,6 +22,7 @@ def squashed_gaussian(
     """
     action = (mean + log_std.exp() * noise).tanh()
     density = noise.square() * 0.5 + log_std + (1.0 - action.square() + epsilon).log()
+    density = density + mean.detach() * 0.0  # around an infinite mean there is none
     return action, -density.sum_features() - mean.features * LOG_OF_ROOT_OF_TWO_PI
 
 
@@ -41,7 +44,8 @@ def categorical(logits: Value, action: Value) -> tuple[Value, Value]:
     """
     shifted = logits - logits.max_features()
     log_probs = shifted - shifted.exp().sum_features().log()
-    entropy = -(log_probs.exp() * log_probs).sum_features()
+    finite = log_probs.clamp(-LARGEST, math.inf)  # what is impossible adds nothing
+    entropy = -(log_probs.exp() * finite).sum_features()
     return log_probs.pick(action), entropy
 
 

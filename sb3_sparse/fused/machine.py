@@ -148,8 +148,6 @@ class Machine:
             if not first <= step < last:
                 continue
             if self.tables.ready(minimised) and not self.controller.awaits(minimised.optimizer):
-                self.controller.passed(minimised.optimizer)
-                self.tables.count(minimised)
                 continue
             self._go(first, step, failed)
             self._step_by_torch(minimised)
@@ -157,10 +155,21 @@ class Machine:
         self._go(first, last, failed)
 
     def _go(self, first: int, last: int, failed: Callable[[str], None] | None = None) -> None:
-        while (at := self._call(self._argument, first, last)) >= 0:
+        while True:
+            at = self._call(self._argument, first, last)
+            self._count(first, last if at < 0 else at)
+            if at < 0:
+                return
             if failed is not None:
                 failed(self.program.checks[id(self.operations[at])])
             first = at + 1
+
+    def _count(self, first: int, last: int) -> None:
+        """Count the steps that the kernels have taken in a range of operations."""
+        for minimised, step in zip(self.program.minimised, self.steps, strict=True):
+            if first <= step < last:
+                self.controller.passed(minimised.optimizer)
+                self.tables.count(minimised)
 
     def _step_by_torch(self, minimised: Minimised) -> None:
         optimizer = minimised.optimizer

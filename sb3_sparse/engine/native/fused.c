@@ -385,7 +385,7 @@ typedef struct {
 
 INLINE void adam(const adam_t *s, vec *p, vec *m, vec *v, vec g) {
     *p *= s->shrink;
-    g += s->decay * *p;
+    if (s->decay[0] != 0) g += s->decay * *p; /* 0 times infinity is no 0 */
     *m += s->first * (g - *m);
     *v = s->second * *v + s->squared * (g * g);
     *p -= s->rate * *m / (root_of(*v) / s->root + s->epsilon);
@@ -441,13 +441,13 @@ static void step_parameter(const parameter_t *p, const group_t *group) {
     }
 }
 
-/* target += factor * (number - target), of parameters `first` and `last`. */
+/* target = (1 - factor) * target + factor * number, of parameters `last` and `first`. */
 static void polyak(const program_t *program, const operation_t *o) {
     const parameter_t *online = program->parameters + o->first, *target = program->parameters + o->last;
     float tau = (float)o->p;
     for (int64_t k = 0; k < online->count; k++) {
         int64_t n = online->flat ? online->flat[k] : k;
-        float x = target->number[n] + tau * (online->number[n] - target->number[n]);
+        float x = (1 - tau) * target->number[n] + tau * online->number[n];
         target->number[n] = x;
         if (target->packed) target->packed[k] = x;
     }
