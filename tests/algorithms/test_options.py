@@ -44,7 +44,7 @@ OPTIONS = [
     ("SAC", dict(learning_rate=Linear(1e-3), tau=0.5, gamma=0.9)),
     ("SAC", dict(n_steps=3, gamma=0.7)),
     ("SAC", dict(policy_kwargs=dict(n_critics=1))),
-    ("SAC", dict(policy_kwargs=dict(n_critics=3))),
+    ("SAC", dict(policy_kwargs=dict(n_critics=3, activation_fn=nn.Tanh))),
     ("SAC", dict(policy_kwargs=dict(net_arch=dict(pi=[20], qf=[12, 30, 7])))),
     ("SAC", dict(policy_kwargs=dict(net_arch=[]))),
     ("SAC", dict(policy_kwargs=dict(share_features_extractor=True))),
