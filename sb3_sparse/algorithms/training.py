@@ -126,7 +126,7 @@ class Training:
         """
         sparse = self._policy.sparse
         capture = [o for o in optimizers if sparse.awaits(o) and sparse.wants_gradients(o)]
-        whole = (*key, *map(id, optimizers), len(optimizers), *map(id, capture))
+        whole = (*key, th.get_num_threads(), *map(id, optimizers), -1, *map(id, capture))
         machine = self._machines.get(whole)
         if machine is None or machine.capacity < batch:
             program = Program(capture)

@@ -12,7 +12,7 @@ import torch as th
 from sb3_sparse.engine.controller import Controller
 from sb3_sparse.engine.native.library import bits_of, library
 from sb3_sparse.fused.inputs import Inputs
-from sb3_sparse.fused.memory import TILE, lay_out
+from sb3_sparse.fused.memory import TILE, Memory, Place
 from sb3_sparse.fused.operations import KINDS, in_phases
 from sb3_sparse.fused.program import Minimised, Program
 from sb3_sparse.fused.tables import Tables
@@ -35,15 +35,18 @@ class Machine:
         self.steps = [self._index_of(m.step) for m in program.minimised]
         self.marks = {name: self._index_of(step) + 1 for name, step in program.marks.items()}
         self.tables = Tables(program, controller)
-        self._work, self._places = lay_out(program.values, batch)
+        self.threads = th.get_num_threads()
+        memory = Memory(self.operations, program.values, batch, self.threads)
+        self._places: dict[Value, Place] = memory.places
+        self._work = memory.work
         self._at = self._work.data_ptr()
         self._view = self._work.numpy()
         self._lanes = {
-            name: self._view[slice(self._places[value], self._places[value] + TILE)]
+            name: self._view[self._place(value) : self._place(value) + TILE]
             for name, value in program.scalars.items()
         }
         for number, value in program.constants.items():
-            self._view[self._places[value] : self._places[value] + TILE] = number
+            self._view[self._place(value) : self._place(value) + TILE] = number
         self._logged = {name: self._place(value) for name, value in program.logged.items()}
         fields = [field for operation in self.operations for field in self._fields(operation)]
         self._operations = (ctypes.c_int64 * len(fields))(*fields)
@@ -57,14 +60,15 @@ class Machine:
         return next(i for i, one in enumerate(self.operations) if one is operation)
 
     def _place(self, value: Value) -> int:
-        return self._places[value.root] + TILE * value.offset
+        return self._places[value.root].at + TILE * value.offset
 
-    def _operand(self, value: Value | None) -> tuple[int, int, int]:
+    def _operand(self, value: Value | None) -> tuple[int, ...]:
+        """``place_t`` of ``fused.h``."""
         if value is None:
-            return 0, 0, 0
-        tile = value.root.features * TILE if value.batched else 0
+            return 0, 0, 0, 0
+        _, thread, tile = self._places[value.root]
         feature = 0 if value.features == 1 else TILE
-        return self._at + 4 * self._place(value), tile, feature
+        return self._at + 4 * self._place(value), thread, tile, feature
 
     def _fields(self, operation: Any) -> list[int]:
         """``operation_t`` of ``fused.h``."""
@@ -92,7 +96,7 @@ class Machine:
         argument[0] = ctypes.addressof(self._operations)
         argument[1:4] = self.tables.addresses
         argument[4] = self.inputs.address
-        argument[6] = th.get_num_threads()
+        argument[6] = min(self.threads, th.get_num_threads())
         argument[7] = self.tables.per_thread
 
     def set(self, scalars: Mapping[str, float]) -> None:

@@ -73,7 +73,7 @@ typedef struct {
 } where_t;
 
 INLINE float *at(const place_t *place, const where_t *where) {
-    return place->base + where->tile * place->tile;
+    return place->base + where->thread * place->thread + where->tile * place->tile;
 }
 
 /* Loops over features and vectors of the operands that a kind has. */

@@ -13,10 +13,11 @@
 
 #include "kernels.h"
 
-/* An operand: where its first number is, and how far apart tiles and features are (0: the same). */
+/* An operand: where its first number is, and how far apart threads, tiles and features are (0: the
+   same). What a phase alone needs has room for one tile of each thread. */
 typedef struct {
     float *base;
-    int64_t tile, feature;
+    int64_t thread, tile, feature;
 } place_t;
 
 /* A linear layer. `row_start` is NULL where its weight is read as a dense matrix. */
