@@ -1,0 +1,199 @@
+"""Programs by themselves: values and gradients against torch, and the order of operations."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch as th
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
+
+from sb3_sparse.engine.controller import Controller
+from sb3_sparse.fused.machine import Machine
+from sb3_sparse.fused.operations import Operation, in_phases
+from sb3_sparse.fused.program import Program
+from sb3_sparse.fused.values import Value
+
+FEATURES = 3
+
+
+class Room:
+    """A program on one vector of parameters and no network."""
+
+    def __init__(self, build, batch, optimizer=th.optim.Adam, start=None, **kwargs):
+        start = th.zeros(FEATURES) if start is None else start
+        self.vector = th.nn.Parameter(start.clone())
+        self.optimizer = optimizer([self.vector], **kwargs)
+        program = Program()
+        x = program.input("x", FEATURES)
+        loss = build(program, x, program.parameter(self.vector))
+        program.log("loss", loss)
+        program.minimise(loss, self.optimizer)
+        self.machine = Machine(program, Controller([], 0, False), batch)
+
+    def step(self, x):
+        self.machine.prepare()
+        self.machine.load({"x": x})
+        self.machine.run()
+        return self.machine.number("loss")
+
+
+def gradient_of(build, x, start):
+    """By a step of size 1 of plain descent, which torch takes with the program's gradient."""
+    room = Room(build, len(x), th.optim.SGD, start, lr=1.0)
+    loss = room.step(x)
+    return loss, start - room.vector.detach()
+
+
+UNARY = {
+    "exp": (lambda v: (v * 0.5).exp(), lambda t: (t * 0.5).exp()),
+    "log": (lambda v: (v.square() + 0.5).log(), lambda t: (t.square() + 0.5).log()),
+    "sqrt": (lambda v: (v.square() + 0.5).sqrt(), lambda t: (t.square() + 0.5).sqrt()),
+    "tanh": (Value.tanh, th.tanh),
+    "sigmoid": (Value.sigmoid, th.sigmoid),
+    "softplus": (Value.softplus, th.nn.functional.softplus),
+    "huber": (Value.huber, lambda t: th.nn.functional.smooth_l1_loss(
+        t, th.zeros_like(t), reduction="none")),
+    "square": (Value.square, th.square),
+    "clamp": (lambda v: v.clamp(-0.7, 0.9), lambda t: t.clamp(-0.7, 0.9)),
+    "negative": (lambda v: -v, lambda t: -t),
+    "part": (lambda v: v[0:1] + v[1:3], lambda t: t[..., 0:1] + t[..., 1:3]),
+    "over one": (lambda v: 1.0 - v * 2.0, lambda t: 1.0 - t * 2.0),
+}  # fmt: skip
+BINARY = {
+    "add": (lambda a, b: a + b, lambda a, b: a + b),
+    "subtract": (lambda a, b: a - b, lambda a, b: a - b),
+    "multiply": (lambda a, b: a * b, lambda a, b: a * b),
+    "divide": (lambda a, b: a / (b.square() + 1.0), lambda a, b: a / (b.square() + 1.0)),
+    "least": (lambda a, b: a.least(b), th.minimum),
+    "sum": (lambda a, b: a.sum_features() * b, lambda a, b: a.sum(-1, keepdim=True) * b),
+}
+STEPS = st.lists(
+    st.sampled_from([name for name in (*UNARY, *BINARY) if name != "part"]), min_size=1, max_size=6
+)
+
+
+def expression(steps, table):
+    def build(x, vector):
+        value = x * vector
+        for name in steps:
+            one = UNARY.get(name) or BINARY[name]
+            value = one[table](value, vector) if name in BINARY else one[table](value)
+        return value.mean()
+
+    return build
+
+
+@settings(max_examples=40, deadline=None)
+@given(STEPS, st.sampled_from([1, 5, 63, 64, 65, 200]), st.integers(0, 1000))
+def test_gradients_of_expressions_equal_those_of_autograd(steps, batch, seed):
+    random = th.Generator().manual_seed(seed)
+    x = th.randn(batch, FEATURES, generator=random)
+    start = th.randn(FEATURES, generator=random)
+    ours, grad = gradient_of(lambda _, a, b: expression(steps, 0)(a, b), x, start)
+    vector = start.double().requires_grad_()
+    loss = expression(steps, 1)(x.double(), vector)
+    loss.backward()
+    scale = max(1.0, float(vector.grad.abs().max()))
+    assume(np.isfinite(scale) and scale < 1e4 and abs(float(loss)) < 1e4)
+    assert ours == pytest.approx(float(loss), rel=1e-4, abs=1e-4)
+    np.testing.assert_allclose(grad, vector.grad, rtol=1e-3, atol=2e-4 * scale)
+
+
+def test_a_part_of_the_features():
+    x, start = th.randn(70, FEATURES), th.randn(FEATURES)
+    ours, grad = gradient_of(lambda _, a, b: UNARY["part"][0](a * b).mean(), x, start)
+    vector = start.clone().requires_grad_()
+    loss = UNARY["part"][1](x * vector).mean()
+    loss.backward()
+    assert ours == pytest.approx(float(loss), abs=1e-6)
+    np.testing.assert_allclose(grad, vector.grad, atol=1e-6)
+
+
+def results_of(function, numbers):
+    """A function of each number, by a program that adds up one at a time."""
+    found = []
+
+    def build(program, x, vector):
+        return (function(x[0:1]) + vector[0:1] * 0.0).sum()
+
+    room = Room(build, 1, th.optim.SGD, lr=0.0)
+    for number in numbers:
+        found.append(room.step(th.full((1, FEATURES), float(number))))
+    return np.array(found, dtype=np.float32)
+
+
+EDGES = {
+    "exp": (Value.exp, th.exp, [-104.0, -100.0, -88.0, -1e-7, 0.0, 1e-7, 1.0, 87.9, 89.0]),
+    "log": (Value.log, th.log, [1e-37, 1e-6, 0.5, 0.999999, 1.0, 1.000001, 2.0, 3e38, 0.0, -1.0]),
+    "tanh": (Value.tanh, th.tanh, [-100.0, -9.0, -1.0, -1e-4, 0.0, 1e-8, 1e-4, 0.5, 8.0, 50.0]),
+    "softplus": (Value.softplus, th.nn.functional.softplus, [-90.0, -20.0, 0.0, 19.9, 20.1, 90.0]),
+}
+
+
+@pytest.mark.parametrize("name", EDGES)
+def test_functions_near_their_edges(name, instructions):
+    function, reference, numbers = EDGES[name]
+    numbers = [*numbers, float("inf"), float("nan"), *(-float("inf"),) * (name != "log")]
+    wanted = reference(th.tensor(numbers).double()).float().numpy()
+    np.testing.assert_allclose(results_of(function, numbers), wanted, rtol=3e-6, atol=1e-37)
+
+
+@pytest.mark.parametrize("batch", [1, 63, 64, 65, 200])
+@pytest.mark.parametrize(
+    "kind", [th.float32, th.float64, th.float16, th.int64, th.int32, th.int16, th.int8, th.uint8,
+             th.bool])  # fmt: skip
+def test_rows_of_every_type(kind, batch):
+    x = (th.arange(batch * FEATURES).view(batch, FEATURES) % 7).to(kind)
+    room = Room(lambda _, a, b: (a + b).sum().sum_features(), 200, th.optim.SGD, lr=0.0)
+    assert room.step(x) == float(x.double().sum())
+
+
+@pytest.mark.parametrize(
+    ("kind", "kwargs"),
+    [
+        (th.optim.Adam, dict(lr=0.1)),
+        (th.optim.Adam, dict(lr=0.1, weight_decay=0.1, betas=(0.5, 0.8), eps=1e-3)),
+        (th.optim.AdamW, dict(lr=0.1, weight_decay=0.3)),
+        (RMSpropTFLike, dict(lr=0.1, alpha=0.9, eps=1e-3, weight_decay=0.1)),
+    ],
+)
+def test_steps_of_optimizers(kind, kwargs):
+    start = th.tensor([1.0, -2.0, 0.5])
+    room = Room(lambda _, a, b: (a * b).square().mean(), 70, kind, start, **kwargs)
+    vector = th.nn.Parameter(start.clone())
+    optimizer = kind([vector], **kwargs)
+    for step in range(10):
+        x = th.randn(70, FEATURES, generator=th.Generator().manual_seed(step))
+        room.step(x)
+        optimizer.zero_grad()
+        (x * vector).square().mean().backward()
+        optimizer.step()
+        th.testing.assert_close(room.vector.detach(), vector.detach(), rtol=1e-5, atol=1e-6)
+    one, two = room.optimizer.state[room.vector], optimizer.state[vector]
+    assert float(one["step"]) == float(two["step"]) == 10
+    for name in two.keys() - {"step"}:
+        th.testing.assert_close(one[name], two[name], rtol=1e-4, atol=1e-7)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.tuples(st.booleans(), st.booleans(), st.integers(0, 99), st.integers(0, 99)),
+                max_size=25))  # fmt: skip
+def test_phases_keep_what_depends_on_each_other_in_order(recorded):
+    program = Program()
+    values = [Value(program, 1, True)]
+    operations = []
+    for tiled, changes, first, second in recorded:
+        values.append(Value(program, 1, tiled))
+        operands = (values[first % (len(values) - 1)], values[second % (len(values) - 1)])
+        to, changes = values[-1], changes and not tiled
+        operations.append(Operation("ADD", to, operands, tiled=tiled, changes=changes))
+    ordered = in_phases(operations)
+    assert sorted(map(id, ordered)) == sorted(map(id, operations))
+    place = {id(operation): number for number, operation in enumerate(ordered)}
+    for number, operation in enumerate(operations):
+        for other in operations[:number]:
+            reads = any(operand is other.to for operand in operation.operands)
+            if reads or other.changes or operation.changes:
+                assert place[id(other)] < place[id(operation)]
