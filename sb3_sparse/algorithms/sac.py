@@ -55,7 +55,7 @@ class SAC(OffPolicy, stable_baselines3.SAC):
 
     def _machine(self, batch_size: int, source: str) -> Machine:
         return self._trains().machine(
-            (self.tau, source), batch_size, self._optimizers(),
+            (source,), batch_size, self._optimizers(),
             lambda program: self._record(program, source),
         )  # fmt: skip
 
@@ -111,7 +111,7 @@ class SAC(OffPolicy, stable_baselines3.SAC):
         program.minimise(actor_loss, actor.optimizer)
         program.mark("followed")
         for one, two in zip(critic.q_networks, target.q_networks, strict=True):
-            program.follow(parts(one), parts(two), self.tau)
+            program.follow(parts(one), parts(two), program.scalar("tau"))
 
     def _train_fused(self, gradient_steps: int, batch_size: int) -> None:
         self.policy.set_training_mode(True)
@@ -123,7 +123,7 @@ class SAC(OffPolicy, stable_baselines3.SAC):
             machine, data = self._next_batch(batch_size, source)
             shape = (machine.batch, *(self.action_space.shape or ()))
             machine.inputs.load({"noise": th.randn(shape), "next_noise": th.randn(shape)})
-            machine.set({"target_entropy": float(self.target_entropy)})
+            machine.set({"target_entropy": float(self.target_entropy), "tau": self.tau})
             if self.ent_coef_optimizer is None:
                 machine.set({"ent_coef": float(self.ent_coef_tensor)})
             last = None if step % self.target_update_interval == 0 else machine.marks["followed"]

@@ -48,7 +48,7 @@ class TD3(OffPolicy, stable_baselines3.TD3):
     def _machine(self, batch_size: int, source: str, delayed: bool) -> Machine:
         optimizers = [self.critic.optimizer, self.actor.optimizer]
         return self._trains().machine(
-            (self.tau, source), batch_size, optimizers if delayed else optimizers[:1],
+            (source,), batch_size, optimizers if delayed else optimizers[:1],
             lambda program: self._record(program, source),
         )  # fmt: skip
 
@@ -77,9 +77,10 @@ class TD3(OffPolicy, stable_baselines3.TD3):
         actor_loss = -q1.mean()
         program.log("actor_loss", actor_loss)
         program.minimise(actor_loss, self.actor.optimizer)
+        tau = program.scalar("tau")
         for one, two in zip(self.critic.q_networks, targets, strict=True):
-            program.follow(parts(one), parts(two), self.tau)
-        program.follow(parts(self.actor.mu), parts(self.actor_target.mu), self.tau)
+            program.follow(parts(one), parts(two), tau)
+        program.follow(parts(self.actor.mu), parts(self.actor_target.mu), tau)
 
     def _train_fused(self, gradient_steps: int, batch_size: int) -> None:
         self.policy.set_training_mode(True)
@@ -95,6 +96,7 @@ class TD3(OffPolicy, stable_baselines3.TD3):
             noise = th.empty(shape).normal_(0, self.target_policy_noise)
             noise = noise.clamp_(-self.target_noise_clip, self.target_noise_clip)
             machine.inputs.load({"noise": noise})
+            machine.set({"tau": self.tau})
             machine.run(0, None if delayed else machine.marks["delayed"])
             critic_losses.append(machine.number("critic_loss"))
             if delayed:

@@ -278,7 +278,7 @@ class Program:
         """Note that an optimizer takes a step."""
         self.minimised.append(Minimised(optimizer, slots, step, captured))
 
-    def follow(self, network: Parts, target_network: Parts, tau: float) -> None:
+    def follow(self, network: Parts, target_network: Parts, tau: Value) -> None:
         """Let a target network follow by Polyak averaging.
 
         :param tau: share of the network
@@ -295,6 +295,4 @@ class Program:
                     self.slot(tensor, number if weight else None)
                     for tensor, number in zip((one, two), numbers, strict=True)
                 )
-                self.record(
-                    "POLYAK", None, first=first, last=last, p=tau, tiled=False, changes=True
-                )
+                self.record("POLYAK", None, tau, first=first, last=last, tiled=False, changes=True)

@@ -274,3 +274,15 @@ def test_a_rate_that_moves_makes_no_new_programs():
     model = make(sb3_sparse, "SAC", learning_rate=lambda remaining: 1e-3 * remaining)
     learn(model)
     assert len(model._trains()._machines) == 1
+
+
+def test_a_share_that_moves_makes_no_new_programs():
+    def follow_faster(model):
+        model.tau *= 1.05
+
+    models = [
+        learn(make(library, "SAC"), Meddler(dict.fromkeys(range(50), follow_faster)))
+        for library in LIBRARIES
+    ]
+    assert len(models[0]._trains()._machines) == 1
+    assert_alike(*models)

@@ -21,7 +21,9 @@ INLINE vec root_of(vec x) {
 
 /* As exp_of, but infinite where float is. */
 INLINE vec whole_exp_of(vec x) {
-    vec y = exp_of(x);
+    ivec large = x > 87;
+    vec y = exp_of(choose(large, x - 1, x));
+    y = choose(large, y * 2.71828183f, y);
     y = choose(x > 88.7228394f, INFINITY + (vec){0}, y);
     return choose(x < -103.97f, (vec){0}, y);
 }
@@ -392,7 +394,7 @@ INLINE void adam(const adam_t *s, vec *p, vec *m, vec *v, vec g) {
 }
 
 INLINE void rmsprop(const adam_t *s, int within, vec *p, vec *v, vec g) {
-    g += s->decay * *p;
+    if (s->decay[0] != 0) g += s->decay * *p;
     *v = s->second * *v + s->squared * (g * g);
     *p -= s->rate * g / (within ? root_of(*v + s->epsilon) : root_of(*v) + s->epsilon);
 }
@@ -441,10 +443,10 @@ static void step_parameter(const parameter_t *p, const group_t *group) {
     }
 }
 
-/* target = (1 - factor) * target + factor * number, of parameters `last` and `first`. */
+/* target = (1 - a) * target + a * number, of parameters `last` and `first`. */
 static void polyak(const program_t *program, const operation_t *o) {
     const parameter_t *online = program->parameters + o->first, *target = program->parameters + o->last;
-    float tau = (float)o->p;
+    float tau = *o->a.base;
     for (int64_t k = 0; k < online->count; k++) {
         int64_t n = online->flat ? online->flat[k] : k;
         float x = (1 - tau) * target->number[n] + tau * online->number[n];

@@ -12,7 +12,7 @@ import torch as th
 from sb3_sparse.errors import ConfigError, MissingKernels
 
 PATH = Path(__file__).with_name("kernels.so")
-VERSION = 8
+VERSION = 9
 """Of what the two sides hand each other; ``dispatch.c`` has the same."""
 
 

@@ -1,0 +1,32 @@
+"""Trains with kernels that the address sanitizer watches; a program of test_bounds."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import torch as th
+from algorithms_support import make
+
+import sb3_sparse
+from sb3_sparse.engine.native import library
+from sb3_sparse.fused import tables
+
+
+def main() -> None:
+    path, instructions, *broken = sys.argv[1:]
+    library.PATH = Path(path)
+    library.use(instructions)
+    if broken:  # gradients and values by columns get less room than they need
+        whole = tables._empty
+        tables._empty = lambda count: whole(max(count - 24, 1))
+    th.set_num_threads(2)
+    for name, compute in (("SAC", "sparse"), ("DQN", "masked"), ("PPO", "masked")):
+        model = make(sb3_sparse, name, policy_kwargs=dict(sparsity=0.6, compute=compute))
+        model.learn(60, callback=sb3_sparse.SparsityCallback("rigl", update_interval=4))
+        assert model.why_not_fused() is None
+    print("within bounds")
+
+
+if __name__ == "__main__":
+    main()
