@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from types import SimpleNamespace
 from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -182,18 +181,10 @@ def _report(policy: BasePolicy) -> SparsityReport:
     """The sparsity report; of a stock policy that of a policy with all of its layers left dense."""
     if isinstance(policy, SparsePolicyMixin):
         return policy.sparsity_report()
-    networks = [
-        SparseNetwork(name, policy, [], list(kernels.items()))
-        for name, kernels in _owned(policy).items()
-    ]
-    dense: Any = SimpleNamespace(
-        sparse=SimpleNamespace(networks=networks),
-        modules=policy.modules,
-        observation_space=policy.observation_space,
-        device=policy.device,
-        normalize_images=policy.normalize_images,
+    owned = _owned(policy)
+    return report_on(
+        policy, [SparseNetwork(name, policy, [], list(owned[name].items())) for name in owned]
     )
-    return report_on(dense)
 
 
 def _owned(policy: BasePolicy) -> dict[str, dict[str, Any]]:

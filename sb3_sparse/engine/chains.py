@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import Any, Protocol
 from weakref import ref
 
 import torch as th
@@ -11,12 +11,24 @@ from torch import nn
 from torch.autograd import forward_ad
 
 from sb3_sparse.engine.products import Pass, Products
+from sb3_sparse.engine.structure import Structure
 from sb3_sparse.errors import UnsupportedError
 
-if TYPE_CHECKING:
-    from sb3_sparse.engine.linear import CompactLinear
-
 PLAIN = (th.Tensor, th.nn.Parameter)
+
+
+class Link(Protocol):
+    """A linear layer that a chain runs by its connections."""
+
+    in_features: int
+    out_features: int
+    bias: Any
+
+    def live(self) -> tuple[Structure, th.Tensor]:
+        """The connections to compute with now, and their values."""
+
+    def held(self) -> tuple[Structure, th.Tensor]:
+        """The same without a graph, where another thread may move connections."""
 
 
 class Chain:
@@ -26,9 +38,7 @@ class Chain:
     :param activations: what follows each: None, or a module that tells its slope by its result
     """
 
-    def __init__(
-        self, layers: Sequence[CompactLinear], activations: Sequence[nn.Module | None]
-    ) -> None:
+    def __init__(self, layers: Sequence[Link], activations: Sequence[nn.Module | None]) -> None:
         self.layers = list(layers)
         self.activations = list(activations)
         self.columns = self.layers[0].in_features

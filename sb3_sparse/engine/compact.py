@@ -196,12 +196,11 @@ class CompactGradient(GradientMask):
         one wanted then, else the last
     """
 
-    layer: CompactLayer
-
     def __init__(
         self, layer: CompactLayer, functional: bool, capturing: Callable[[], bool]
     ) -> None:
-        super().__init__(layer, capturing)
+        super().__init__(capturing)
+        self.layer = layer
         self.functional = functional
         self._arriving: list[DenseGradient] = []
 

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch as th
 from torch import fx, nn
 
+from sb3_sparse.errors import UnsupportedError
 from sb3_sparse.export.activations import called, scaled
-from sb3_sparse.export.nodes import Add, Multiply
-
-if TYPE_CHECKING:
-    from sb3_sparse.export.trace import Tracer
+from sb3_sparse.export.nodes import Add, Multiply, Node
 
 ADD = (operator.add, operator.iadd, th.add, "add", "add_")
 SUBTRACT = (operator.sub, operator.isub, th.sub, "sub", "sub_")
@@ -25,6 +23,31 @@ IN_PLACE = (operator.iadd, operator.isub, operator.imul, operator.itruediv)
 CONCAT = (th.cat, th.concat, th.concatenate)
 SQUARE = (operator.pow, th.pow, "pow", th.square, "square")
 RESHAPE = ("view", "reshape", th.reshape)
+
+
+class Tracer(Protocol):
+    """Collects operations while it walks through modules."""
+
+    changed: set[int]
+    """Values that torch changes in place."""
+
+    def walk(self, module: nn.Module, value: int | Mapping[str, int]) -> int:
+        """The result of a module applied to a value, or to a dict of values."""
+
+    def add(self, node: Node) -> int:
+        """Append an operation; the number of its result."""
+
+    def concat(self, values: list[int]) -> int:
+        """Values one after the other."""
+
+    def shape_of(self, value: int) -> tuple[int, ...]:
+        """Shape of a value so far."""
+
+    def sources(self, value: int) -> list[int]:
+        """A value, and what it is another view of."""
+
+    def refusal(self, module: nn.Module, why: str = "") -> UnsupportedError:
+        """The error for a module, which it names."""
 
 
 def trace_forward(tracer: Tracer, module: nn.Module, value: int | Mapping[str, int]) -> int:

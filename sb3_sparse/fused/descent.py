@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch as th
 
 from sb3_sparse.fused.errors import NotCovered
+from sb3_sparse.fused.recording import Behind, Recording
 from sb3_sparse.fused.values import Value
-
-if TYPE_CHECKING:
-    from sb3_sparse.fused.program import Behind, Program
 
 
 class Descent:
@@ -20,7 +18,7 @@ class Descent:
     :param optimizer: moves those of its parameters that the loss depends on
     """
 
-    def __init__(self, program: Program, optimizer: th.optim.Optimizer) -> None:
+    def __init__(self, program: Recording, optimizer: th.optim.Optimizer) -> None:
         self._program = program
         self._optimizer = optimizer
         self._captured = id(optimizer) in program.capture
@@ -98,7 +96,7 @@ class Descent:
         """Add to a gradient, summed over what ``parent`` was broadcast to."""
         if g.features > parent.features:
             g = g.sum_features()
-        elif g.features == 1 < parent.features:
+        elif g.features < parent.features and parent not in self._program.parts:
             spread = Value(self._program, parent.features, g.batched)
             self._program.record("COPY", spread, g)
             g = spread

@@ -14,7 +14,8 @@ from sb3_sparse.engine.native.library import bits_of, library
 from sb3_sparse.fused.inputs import Inputs
 from sb3_sparse.fused.memory import TILE, Memory, Place
 from sb3_sparse.fused.operations import KINDS, in_phases
-from sb3_sparse.fused.program import Minimised, Program
+from sb3_sparse.fused.program import Program
+from sb3_sparse.fused.recording import Minimised
 from sb3_sparse.fused.tables import Tables
 from sb3_sparse.fused.values import Value
 

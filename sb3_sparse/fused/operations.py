@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    from sb3_sparse.fused.values import Value
+from sb3_sparse.fused.values import Value
 
 NAMES = """
 COPY ADD SUBTRACT MULTIPLY DIVIDE LEAST LESS SAME CLAMP INSIDE EXP LOG SQRT ABS HUBER ACTIVATION

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from typing import Any, NamedTuple
 
 import torch as th
 from torch import nn
@@ -13,85 +11,27 @@ from sb3_sparse.engine.activations import number_of, tells_its_slope
 from sb3_sparse.fused.descent import Descent
 from sb3_sparse.fused.errors import NotCovered
 from sb3_sparse.fused.operations import Operation
-from sb3_sparse.fused.values import Number, Value
+from sb3_sparse.fused.recording import NUMBERS, Behind, Recording
+from sb3_sparse.fused.values import Value
 
-NUMBERS = {"RELU": 1, "TANH": 2, "SIGMOID": 3, "SOFTPLUS": 11}
 WITH_SLOPE_AT_INPUT = (nn.SiLU, nn.GELU)
 RELU = NUMBERS["RELU"]
 Parts = Sequence[tuple[nn.Linear, nn.Module | None]]
 
 
-@dataclass
-class Slot:
-    """A parameter, as one operation on parameters sees it.
-
-    :param tensor: torch's
-    :param layer: number of the layer whose weight it is; None: it is no weight
-    :param optimizer: what moves it; None: it is not moved by one
-    """
-
-    tensor: th.Tensor
-    layer: int | None
-    optimizer: th.optim.Optimizer | None = None
-
-
-@dataclass
-class Minimised:
-    """A loss that an optimizer makes less.
-
-    :param optimizer: which
-    :param slots: range of its parameters that have a gradient
-    :param step: the operation in which the optimizer's step is taken
-    :param captured: whether dense gradients are there at that step
-    """
-
-    optimizer: th.optim.Optimizer
-    slots: tuple[int, int]
-    step: Operation
-    captured: bool
-
-
-class Behind(NamedTuple):
-    """What a value is the result of.
-
-    :param layer: number of the linear layer
-    :param x: its input
-    :param activation: number and parameters of the activation within it
-    """
-
-    layer: int
-    x: Value
-    activation: tuple[int, float, float]
-
-
-class Program:
+class Program(Recording):
     """Records operations. Losses are written with :class:`Value`, as they are with tensors.
 
     :param capture: optimizers whose layers' dense gradients are wanted too
     """
 
     def __init__(self, capture: Iterable[th.optim.Optimizer] = ()) -> None:
-        self.capture = list(map(id, capture))
-        self.values: list[Value] = []
-        self.operations: list[Operation] = []
-        self.layers: list[nn.Linear] = []
-        self.slots: list[Slot] = []
+        super().__init__(capture)
         self.rows: list[tuple[str, int]] = []
-        self.scalars: dict[str, Value] = {}
-        self.constants: dict[float, Value] = {}
         self.logged: dict[str, Value] = {}
-        self.minimised: list[Minimised] = []
         self.checks: dict[int, str] = {}
         self.marks: dict[str, Operation] = {}
         self._places: dict[int, int] = {}
-        self.vectors: dict[int, Value] = {}
-        """Vectors of parameters by the id of their tensor."""
-        self.behind: dict[Value, Behind] = {}
-        self._parts: dict[Value, list[Value]] = {}
-        self.turned: set[int] = set()
-        """Layers whose values by columns are up to date."""
-        self.needs: set[Value] = set()
-        """Values whose gradient the loss at hand asks for."""
 
     # What comes from outside
 
@@ -103,22 +43,6 @@ class Program:
         self.rows.append((name, features))
         return value
 
-    def scalar(self, name: str) -> Value:
-        """A number that each run is handed."""
-        if name not in self.scalars:
-            self.scalars[name] = Value(self, 1, False)
-        return self.scalars[name]
-
-    def constant(self, number: float) -> Value:
-        """A number that stays."""
-        if number not in self.constants:
-            self.constants[number] = Value(self, 1, False)
-        return self.constants[number]
-
-    def value(self, number: Number) -> Value:
-        """The value, or that of a number."""
-        return number if isinstance(number, Value) else self.constant(float(number))
-
     def parameter(self, tensor: th.Tensor) -> Value:
         """A vector of parameters outside of layers, as it is now."""
         value = Value(self, tensor.numel(), False)
@@ -127,23 +51,6 @@ class Program:
         return value
 
     # Operations
-
-    def record(
-        self, kind: str, to: Value | None, *operands: Value, features: int = 0, **others: Any
-    ) -> Operation:
-        """Append an operation; it runs on tiles if its result is batched."""
-        if to is not None:
-            features = to.features
-            others.setdefault("tiled", to.batched)
-        operation = Operation(kind, to, operands, features, **others)
-        self.operations.append(operation)
-        return operation
-
-    def activated(self, x: Value, name: str, p: float = 0.0, q: float = 0.0) -> Value:
-        """An activation of ``x``; whoever asks for it knows its gradient."""
-        made = Value(self, x.features, x.batched)
-        self.record("ACTIVATION", made, x, number=NUMBERS[name], p=p, q=q)
-        return made
 
     def joined(self, values: Sequence[Value]) -> Value:
         """Their features one after the other."""
@@ -158,7 +65,7 @@ class Program:
             parents.append((value, back))
             at += value.features
         made.parents = tuple(parents)
-        self._parts[made] = list(values)
+        self.parts[made] = list(values)
         return made
 
     def network(self, parts: Parts, x: Value) -> Value:
@@ -206,13 +113,6 @@ class Program:
             self.record("PACK", None, number=self.slot(module.weight, place), tiled=False)
         return place
 
-    def slot(
-        self, tensor: th.Tensor, layer: int | None, optimizer: th.optim.Optimizer | None = None
-    ) -> int:
-        """A row of the table of parameters; its number."""
-        self.slots.append(Slot(tensor, layer, optimizer))
-        return len(self.slots) - 1
-
     def _back_through(self, layer: int, x: Value, g: Value) -> Value:
         """The gradient of a layer's input, for the features alone whose gradient is wanted."""
         if layer not in self.turned:
@@ -232,7 +132,7 @@ class Program:
         return made
 
     def _wanted(self, x: Value) -> tuple[int, int]:
-        parts = self._parts.get(x)
+        parts = self.parts.get(x)
         if parts is None:
             return 0, x.features
         ends = [0]
@@ -267,16 +167,6 @@ class Program:
         :raises NotCovered: if the loss uses a layer twice
         """
         Descent(self, optimizer).record(loss, clip)
-
-    def finish_step(
-        self,
-        optimizer: th.optim.Optimizer,
-        slots: tuple[int, int],
-        step: Operation,
-        captured: bool,
-    ) -> None:
-        """Note that an optimizer takes a step."""
-        self.minimised.append(Minimised(optimizer, slots, step, captured))
 
     def follow(self, network: Parts, target_network: Parts, tau: Value) -> None:
         """Let a target network follow by Polyak averaging.

@@ -11,7 +11,8 @@ import torch as th
 from sb3_sparse.engine.controller import Controller
 from sb3_sparse.engine.native.library import bits_of
 from sb3_sparse.fused.optimizers import FIELDS, Steps
-from sb3_sparse.fused.program import Minimised, Program, Slot
+from sb3_sparse.fused.program import Program
+from sb3_sparse.fused.recording import Minimised, Slot
 from sb3_sparse.fused.storage import Storage, Stored, check_readable
 
 ALIGNED = 16

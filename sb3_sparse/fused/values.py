@@ -3,14 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Union
-
-if TYPE_CHECKING:
-    from sb3_sparse.fused.program import Program
+from typing import Any, Protocol, Union
 
 Number = Union["Value", float]
 Back = Callable[["Value"], "Value"]
 """The share of a parent in the gradient of a value."""
+
+
+class Recorder(Protocol):
+    """Notes what is done with values."""
+
+    values: list[Value]
+
+    def record(self, kind: str, to: Value | None, *operands: Value, **others: Any) -> Any:
+        """Append an operation."""
+
+    def scalar(self, name: str) -> Value:
+        """A number that each run is handed."""
+
+    def constant(self, number: float) -> Value:
+        """A number that stays."""
+
+    def value(self, number: Number) -> Value:
+        """The value, or that of a number."""
+
+    def activated(self, x: Value, name: str, p: float = 0.0, q: float = 0.0) -> Value:
+        """An activation of ``x``."""
 
 
 class Value:
@@ -27,7 +45,7 @@ class Value:
 
     def __init__(
         self,
-        program: Program,
+        program: Recorder,
         features: int,
         batched: bool,
         parents: tuple[tuple[Value, Back], ...] = (),

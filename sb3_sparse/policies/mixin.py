@@ -181,7 +181,7 @@ class SparsePolicyMixin(Acts):
         """
         check_places(self, self.sparse.layers)
         self.sparse.enforce()
-        return report_on(self)
+        return report_on(self, self.sparse.networks)
 
     def set_training_mode(self, mode: bool) -> None:
         """As in SB3. Every ``train()`` calls it first: here a copied policy gets its hooks back."""

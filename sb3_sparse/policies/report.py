@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.preprocessing import preprocess_obs
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
 from sb3_sparse.engine.kernels import Kernel
+from sb3_sparse.engine.network import SparseNetwork
 from sb3_sparse.policies.spec import NetworkSpec
-
-if TYPE_CHECKING:
-    from sb3_sparse.policies.mixin import SparsePolicyMixin
 
 NON_ZEROS = "non-zeros"
 MASKED = "masked"
@@ -140,13 +139,17 @@ def _costs(flops: int, dense_flops: int) -> tuple[str, str]:
     return (f"{flops:,}", f"{flops / dense_flops:.3f}") if dense_flops else ("?", "?")
 
 
-def report_on(policy: SparsePolicyMixin) -> SparsityReport:
-    """Collect the report of a policy as it is now."""
+def report_on(policy: BasePolicy, networks: Iterable[SparseNetwork]) -> SparsityReport:
+    """Collect the report of a policy as it is now.
+
+    :param policy: sparse or dense
+    :param networks: its networks; of a dense policy with all layers outside the budget
+    """
     positions = _conv_positions(policy)
     activated = _activated(policy)
     layers = []
     counted: set[int] = set()
-    for network in policy.sparse.networks:
+    for network in networks:
         compact = {layer.name for layer in network.layers if layer.compact}
         kernels: list[tuple[str, Kernel, tuple[int, ...], int, bool]] = [
             (layer.name, layer.module, layer.shape, layer.nnz, True) for layer in network.layers
@@ -176,7 +179,7 @@ def report_on(policy: SparsePolicyMixin) -> SparsityReport:
     return SparsityReport((*layers, *_other_matrices(policy, counted)))
 
 
-def _other_matrices(policy: SparsePolicyMixin, counted: set[int]) -> list[LayerReport]:
+def _other_matrices(policy: BasePolicy, counted: set[int]) -> list[LayerReport]:
     """Trained matrices that belong to no Linear or Conv layer, which are dense: embeddings, say.
 
     A ``log_std`` is no connection, and targets do not count.
@@ -224,7 +227,7 @@ def _activated(policy: nn.Module) -> set[int]:
     return found
 
 
-def _conv_positions(policy: SparsePolicyMixin) -> dict[int, int]:
+def _conv_positions(policy: BasePolicy) -> dict[int, int]:
     """Output positions of each convolution, read off a forward pass of an empty observation."""
     positions: dict[int, int] = {}
 
