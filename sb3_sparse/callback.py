@@ -135,11 +135,12 @@ class SparsityCallback(BaseCallback):
         never_moved = not any(network.mask_updates for network in sparse.networks)
         if self.plan.topology.options and sparse.updates_due == 0 and never_moved:
             warn(
-                f"{self.plan.method!r} had no mask update, so this was static training: the "
-                f"networks have made {', '.join(str(n.clock) for n in sparse.networks)} gradient "
-                f"steps, and update_interval is {self.plan.update_interval}, with updates from "
-                f"{self.plan.begin:.0%} to {self.plan.end:.0%} of training; train longer or choose "
-                "a smaller one"
+                f"{self.plan.method!r} had no mask update, so this was static training. An update "
+                f"is due at every {self.plan.update_interval}th gradient step of a network between "
+                f"{self.plan.begin:.0%} and {self.plan.end:.0%} of training, and none fell there ("
+                + ", ".join(f"{n.name}: {n.clock} steps in all" for n in sparse.networks)
+                + "); train longer, choose a smaller update_interval or, where gradient steps "
+                "begin late, a smaller learning_starts"
             )
 
     def _note_progress(self) -> None:

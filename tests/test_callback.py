@@ -271,7 +271,8 @@ def test_a_pruned_model_can_go_on_with_any_method():
 
 def test_training_too_short_for_an_update_says_so():
     with pytest.warns(
-        UserWarning, match=r"no mask update.*20, 20 gradient steps.*is 1000.*from 0% to 80%"
+        UserWarning,
+        match=r"no mask update.*every 1000th.*0% and 80%.*actor: 20 steps",
     ):
         make("SAC").learn(40, callback=SparsityCallback("set"))
 

@@ -24,7 +24,7 @@ class A2C(OnPolicy, stable_baselines3.A2C):
             super().train()
 
     def _next_machine(self) -> Machine:
-        self._trains().begin(self.policy, METHODS)
+        self._trains().begin(self, METHODS)
         batch = self.rollout_buffer.buffer_size * self.rollout_buffer.n_envs
         key = (self.normalize_advantage,)
         return self._trains().machine(key, batch, [self.policy.optimizer], self._record)

@@ -28,7 +28,7 @@ class DQN(OffPolicy, stable_baselines3.DQN):
             super().train(gradient_steps, batch_size)
 
     def _next_machine(self) -> Machine:
-        self._trains().begin(self.policy, METHODS)
+        self._trains().begin(self, METHODS)
         return self._machine(self.batch_size, self._find_source())
 
     def _machine(self, batch_size: int, source: str) -> Machine:
@@ -50,7 +50,7 @@ class DQN(OffPolicy, stable_baselines3.DQN):
     def _train_fused(self, gradient_steps: int, batch_size: int) -> None:
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
-        self._trains().begin(self.policy, METHODS)
+        self._trains().begin(self, METHODS)
         source = self._find_source()
         losses = []
         for _ in range(gradient_steps):

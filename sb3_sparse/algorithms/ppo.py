@@ -41,7 +41,7 @@ class PPO(OnPolicy, stable_baselines3.PPO):
             super().train()
 
     def _next_machine(self) -> Machine:
-        self._trains().begin(self.policy, METHODS)
+        self._trains().begin(self, METHODS)
         total = self.rollout_buffer.buffer_size * self.rollout_buffer.n_envs
         return self._machine(min(self.batch_size, total))
 

@@ -45,7 +45,7 @@ class SAC(OffPolicy, stable_baselines3.SAC):
         :raises NotCovered: if they are SB3's own
         """
         own = () if self.log_ent_coef is None else (self.log_ent_coef,)
-        self._trains().begin(self.policy, METHODS, own)
+        self._trains().begin(self, METHODS, own)
         if self.tau >= 1:
             raise NotCovered("targets that are copies")
 

@@ -37,7 +37,7 @@ class TD3(OffPolicy, stable_baselines3.TD3):
 
         :raises NotCovered: if they are SB3's own
         """
-        self._trains().begin(self.policy, METHODS)
+        self._trains().begin(self, METHODS)
         if self.tau >= 1:
             raise NotCovered("targets that are copies")
 

@@ -61,17 +61,18 @@ class Training:
 
     def begin(
         self,
-        policy: BasePolicy,
+        model: BaseAlgorithm,
         methods: dict[str, tuple[str, ...]],
         others: Sequence[th.Tensor] = (),
     ) -> None:
-        """Look at the policy before a round of gradient steps.
+        """Look at the policy of a model before a round of gradient steps.
 
         :param methods: by the dotted name of a module ("": the policy), those that SB3's
             ``train()`` calls
         :param others: parameters that are trained beside the policy's
         :raises NotCovered: if somebody would notice, or miss, that SB3 does not call them
         """
+        policy = model.policy
         if unwrapped(policy) is not policy:
             raise NotCovered("the policy is compiled")
         if not isinstance(policy, SparsePolicyMixin):
@@ -88,6 +89,9 @@ class Training:
             self._acting = [vars(m) for m in modules if "action_dist" in vars(m)]
             self._settings = self._settings_now()
             self._watch = Watch(modules)
+        for name in methods:
+            if vars(model).get(name) is not policy._modules.get(name) and hasattr(model, name):
+                raise NotCovered(f"{name} is another module in the model than in its policy")
         if any(chain.from_iterable(map(HOOKS, self._hooked))) or _has_any_global_hook():  # type: ignore[no-untyped-call]
             raise NotCovered("hooks on modules")
         tensors = [*self._tensors, *others]
@@ -102,6 +106,8 @@ class Training:
             self._seen = seen
         if th.is_autocast_enabled("cpu") or th.is_anomaly_enabled():
             raise NotCovered("autocast or anomaly detection")
+        for tensor in tensors:
+            tensor.grad = None  # as SB3's steps begin
         self._policy, self._prepared = policy, None
 
     def _settings_now(self) -> list[Any]:
@@ -191,8 +197,9 @@ def parts(*modules: nn.Module) -> Parts:
     """
     found = parts_of(modules)
     if found is None:
-        kinds = {type(m).__name__ for module in modules for m in module.modules()}
-        raise NotCovered(f"a network of {', '.join(sorted(kinds))}")
+        inner = (m for module in modules for m in module.modules() if not list(m.children()))
+        others = {type(m).__name__ for m in inner if parts_of([nn.Linear(1, 1), m]) is None}
+        raise NotCovered(f"a network with {', '.join(sorted(others)) or 'modules of its own'}")
     return found
 
 
@@ -255,14 +262,14 @@ class Fused(BaseAlgorithm):
         try:
             self._next_machine()
         except NotCovered as why:
-            return str(why)
+            return why.reason
         return None
 
     def _not_covered(self, why: NotCovered) -> None:
         """Let the log say once why gradient steps are SB3's own, where the policy is sparse."""
         training = self._trains()
-        training.reason = reason = str(why)
+        training.reason = reason = why.reason
         if reason not in training.said:
             training.said.add(reason)
             if isinstance(unwrapped(self.policy), SparsePolicyMixin):
-                self.logger.info(f"Gradient steps are Stable-Baselines3's own: {why}")
+                self.logger.info(f"Gradient steps are Stable-Baselines3's own: {reason}")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import pytest
 import stable_baselines3
 import torch as th
@@ -17,6 +19,7 @@ from torch import nn
 
 import sb3_sparse
 from sb3_sparse.engine.native import library
+from sb3_sparse.fused.errors import NotCovered
 from sb3_sparse.policies.actor_critic import SparseActorCriticPolicy
 from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.policies.dqn import SparseDQNPolicy
@@ -90,7 +93,7 @@ def dropout():
 
 def test_layers_that_are_no_activations():
     kwargs = dict(activation_fn=dropout)
-    assert_falls_back("DQN", "a network of Dropout, Linear, Sequential", policy_kwargs=kwargs)
+    assert_falls_back("DQN", "a network with Dropout", policy_kwargs=kwargs)
 
 
 class Normalised(SparseDQNPolicy):
@@ -296,3 +299,35 @@ def test_settings_of_activations_are_followed(name):
         return learn(model, steps=10)
 
     assert_alike(train(sb3_sparse), train(stable_baselines3))
+
+
+@pytest.mark.parametrize(
+    ("name", "part"),
+    [("DQN", "q_net_target"), ("SAC", "critic_target"), ("TD3", "actor_target")],
+)
+def test_a_network_of_the_model_that_is_none_of_its_policy(name, part):
+    def replace(model):
+        twin = copy.deepcopy(getattr(model, part))
+        with th.no_grad():
+            for parameter in twin.parameters():
+                parameter.mul_(3)
+        setattr(model, part, twin)
+
+    assert_falls_back(name, f"{part} is another module", replace)
+
+
+@pytest.mark.parametrize("name", ["SAC", "PPO"])
+def test_gradients_of_the_user_s_own_do_not_pile_up(name):
+    model = learn(make(sb3_sparse, name))
+    for parameter in model.policy.parameters():
+        parameter.grad = th.ones_like(parameter)
+    learn(model)
+    moved = [p for o in model.policy.sparse.optimizers for g in o.param_groups for p in g["params"]]
+    assert model.why_not_fused() is None
+    assert all(parameter.grad is None for parameter in moved)
+
+
+def test_the_error_of_an_algorithm_without_a_way_back_says_what_is_covered():
+    model = make(sb3_sparse, "DQN", policy_kwargs=dict(activation_fn=nn.Softplus))
+    with pytest.raises(NotCovered, match=r"cannot be fused: the activation Softplus\. The page on"):
+        model._next_machine()
