@@ -17,7 +17,8 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, Flatten
 from torch import nn
 from torch.nn.modules.module import _has_any_global_hook
 
-from sb3_sparse.engine.activations import ADJUSTABLE, number_of
+from sb3_sparse.engine.activations import ACTIVATIONS, ADJUSTABLE, number_of
+from sb3_sparse.engine.linear import CompactLinear
 from sb3_sparse.engine.native.library import why_missing
 from sb3_sparse.engine.paths import parts_of
 from sb3_sparse.engine.watch import Watch, patched
@@ -31,6 +32,7 @@ from sb3_sparse.policies.storage import KNOWN
 
 HOOKS = itemgetter("_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_pre_hooks")
 SEEN = attrgetter("requires_grad", "_backward_hooks", "_post_accumulate_grad_hooks")
+KNOWN_MODULES = (nn.Linear, CompactLinear, nn.Identity, *ACTIVATIONS)
 Build = Callable[[Program], None]
 
 
@@ -198,7 +200,7 @@ def parts(*modules: nn.Module) -> Parts:
     found = parts_of(modules)
     if found is None:
         inner = (m for module in modules for m in module.modules() if not list(m.children()))
-        others = {type(m).__name__ for m in inner if parts_of([nn.Linear(1, 1), m]) is None}
+        others = {type(m).__name__ for m in inner if type(m) not in KNOWN_MODULES}
         raise NotCovered(f"a network with {', '.join(sorted(others)) or 'modules of its own'}")
     return found
 
