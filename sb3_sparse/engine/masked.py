@@ -59,7 +59,6 @@ class MaskedLayer(SparseLayer):
         self._targets: list[Kernel] = []
         self._connections = object()
         self._seen: tuple[int, int] | None = None
-        self._settled: list[tuple[int, int, object]] = []
         ones = th.ones_like(module.weight, requires_grad=False)
         module.register_buffer(MASK_KEY, ones.bool())
         module.register_buffer(FLOAT_MASK_KEY, ones, persistent=False)
@@ -144,14 +143,6 @@ class MaskedLayer(SparseLayer):
         with th.no_grad():
             self.weight.copy_(dense.view(self.shape))
         self.remask()
-
-    def settle_targets(self, soft: bool) -> None:
-        targets = [
-            (t.weight._version, t.weight.data_ptr(), self._connections) for t in self._targets
-        ]
-        if soft or targets != self._settled:
-            super().settle_targets(soft)
-            self._settled = targets
 
     def _dense_targets(self) -> Iterable[NDArray[np.float32]]:
         return (target.weight.detach().cpu().numpy() for target in self._targets)
