@@ -7,21 +7,12 @@ from functools import partial
 import stable_baselines3
 
 from sb3_sparse.algorithms.on_policy import METHODS, OnPolicy
-from sb3_sparse.fused.errors import NotCovered
 from sb3_sparse.fused.machine import Machine
 from sb3_sparse.fused.program import Program
 
 
 class A2C(OnPolicy, stable_baselines3.A2C):
     """Stable-Baselines3's A2C; each gradient step of a sparse policy is one call of the kernels."""
-
-    def train(self) -> None:
-        """As in SB3. What programs do not cover, such as images or gSDE, SB3 trains."""
-        try:
-            self._train_fused()
-        except NotCovered as why:
-            self._not_covered(why)
-            super().train()
 
     def _next_machine(self) -> Machine:
         self._trains().begin(self, METHODS)

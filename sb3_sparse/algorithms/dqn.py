@@ -6,7 +6,6 @@ import stable_baselines3
 
 from sb3_sparse.algorithms.off_policy import OffPolicy
 from sb3_sparse.algorithms.training import mean, parts
-from sb3_sparse.fused.errors import NotCovered
 from sb3_sparse.fused.machine import Machine
 from sb3_sparse.fused.program import Program
 
@@ -18,14 +17,6 @@ METHODS: dict[str, tuple[str, ...]] = {
 
 class DQN(OffPolicy, stable_baselines3.DQN):
     """Stable-Baselines3's DQN; each gradient step of a sparse policy is one call of the kernels."""
-
-    def train(self, gradient_steps: int, batch_size: int = 100) -> None:
-        """As in SB3. What programs do not cover, such as images, SB3 trains."""
-        try:
-            self._train_fused(gradient_steps, batch_size)
-        except NotCovered as why:
-            self._not_covered(why)
-            super().train(gradient_steps, batch_size)
 
     def _next_machine(self) -> Machine:
         self._trains().begin(self, METHODS)
@@ -47,7 +38,7 @@ class DQN(OffPolicy, stable_baselines3.DQN):
         program.log("loss", loss)
         program.minimise(loss, self.policy.optimizer, clip=program.scalar("max_grad_norm"))
 
-    def _train_fused(self, gradient_steps: int, batch_size: int) -> None:
+    def _train_fused(self, gradient_steps: int, batch_size: int = 100) -> None:
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
         self._trains().begin(self, METHODS)

@@ -9,7 +9,6 @@ import numpy as np
 import stable_baselines3
 
 from sb3_sparse.algorithms.on_policy import METHODS, OnPolicy
-from sb3_sparse.fused.errors import NotCovered
 from sb3_sparse.fused.machine import Machine
 from sb3_sparse.fused.program import Program
 
@@ -31,14 +30,6 @@ TITLES = (
 
 class PPO(OnPolicy, stable_baselines3.PPO):
     """Stable-Baselines3's PPO; each gradient step of a sparse policy is one call of the kernels."""
-
-    def train(self) -> None:
-        """As in SB3. What programs do not cover, such as images or gSDE, SB3 trains."""
-        try:
-            self._train_fused()
-        except NotCovered as why:
-            self._not_covered(why)
-            super().train()
 
     def _next_machine(self) -> Machine:
         self._trains().begin(self, METHODS)

@@ -27,14 +27,6 @@ METHODS: dict[str, tuple[str, ...]] = {
 class SAC(OffPolicy, stable_baselines3.SAC):
     """Stable-Baselines3's SAC; each gradient step of a sparse policy is one call of the kernels."""
 
-    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
-        """As in SB3. What programs do not cover, such as images or gSDE, SB3 trains."""
-        try:
-            self._train_fused(gradient_steps, batch_size)
-        except NotCovered as why:
-            self._not_covered(why)
-            super().train(gradient_steps, batch_size)
-
     def _optimizers(self) -> list[th.optim.Optimizer]:
         optimizers = [self.actor.optimizer, self.critic.optimizer]
         return optimizers + ([self.ent_coef_optimizer] if self.ent_coef_optimizer else [])
@@ -113,7 +105,7 @@ class SAC(OffPolicy, stable_baselines3.SAC):
         for one, two in zip(critic.q_networks, target.q_networks, strict=True):
             program.follow(parts(one), parts(two), program.scalar("tau"))
 
-    def _train_fused(self, gradient_steps: int, batch_size: int) -> None:
+    def _train_fused(self, gradient_steps: int, batch_size: int = 64) -> None:
         self.policy.set_training_mode(True)
         self._update_learning_rate(self._optimizers())
         self._begin()

@@ -32,7 +32,11 @@ def trainer_of(algorithm: type[BaseAlgorithm]) -> type:
 
     :param algorithm: any class of an algorithm, a user's own too
     """
-    trainer = next((cls for cls in algorithm.__mro__ if "train" in vars(cls)), algorithm)
-    if not trainer.__module__.startswith("sb3_sparse.algorithms."):
-        return trainer
-    return next(cls for cls in trainer.__mro__ if not cls.__module__.startswith("sb3_sparse."))
+    return next(
+        (
+            cls
+            for cls in algorithm.__mro__
+            if "train" in vars(cls) and not cls.__module__.startswith("sb3_sparse.algorithms.")
+        ),
+        algorithm,
+    )

@@ -24,14 +24,6 @@ METHODS: dict[str, tuple[str, ...]] = {
 class TD3(OffPolicy, stable_baselines3.TD3):
     """Stable-Baselines3's TD3; each gradient step of a sparse policy is one call of the kernels."""
 
-    def train(self, gradient_steps: int, batch_size: int = 100) -> None:
-        """As in SB3. What programs do not cover, such as images, SB3 trains."""
-        try:
-            self._train_fused(gradient_steps, batch_size)
-        except NotCovered as why:
-            self._not_covered(why)
-            super().train(gradient_steps, batch_size)
-
     def _begin(self) -> None:
         """Look at the model before a round of gradient steps.
 
@@ -82,7 +74,7 @@ class TD3(OffPolicy, stable_baselines3.TD3):
             program.follow(parts(one), parts(two), tau)
         program.follow(parts(self.actor.mu), parts(self.actor_target.mu), tau)
 
-    def _train_fused(self, gradient_steps: int, batch_size: int) -> None:
+    def _train_fused(self, gradient_steps: int, batch_size: int = 100) -> None:
         self.policy.set_training_mode(True)
         self._update_learning_rate([self.actor.optimizer, self.critic.optimizer])
         self._begin()

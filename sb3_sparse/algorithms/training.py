@@ -13,7 +13,7 @@ import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.preprocessing import preprocess_obs
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 from torch.nn.modules.module import _has_any_global_hook
 
@@ -27,7 +27,7 @@ from sb3_sparse.fused.machine import Machine
 from sb3_sparse.fused.program import Parts, Program
 from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.policies.mixin import SparsePolicyMixin
-from sb3_sparse.policies.shortcut import takes_vectors, untouched
+from sb3_sparse.policies.shortcut import only_flattens, takes_vectors, untouched
 from sb3_sparse.policies.storage import KNOWN
 
 HOOKS = itemgetter("_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_pre_hooks")
@@ -164,17 +164,8 @@ def _check_policy(policy: SparsePolicyMixin, methods: dict[str, tuple[str, ...]]
         if not untouched(policy.get_submodule(name), called):
             raise NotCovered(f"{name or 'the policy'} has methods of its own")
     for module in policy.modules():
-        if isinstance(module, BaseFeaturesExtractor) and not _only_flattens(module):
+        if isinstance(module, BaseFeaturesExtractor) and not only_flattens(module):
             raise NotCovered(f"the features extractor {type(module).__name__}")
-
-
-def _only_flattens(extractor: nn.Module) -> bool:
-    flatten: Any = extractor._modules.get("flatten")
-    return (
-        type(extractor) is FlattenExtractor
-        and type(flatten) is nn.Flatten
-        and (flatten.start_dim, flatten.end_dim) == (1, -1)
-    )
 
 
 def _is_watched(tensor: Any) -> bool:
@@ -250,6 +241,24 @@ class Fused(BaseAlgorithm):
         """What would run the next gradient step.
 
         :raises NotCovered: if programs cannot compute it
+        """
+
+    def train(self, *args: Any, **kwargs: Any) -> None:
+        """As in SB3, with the arguments that the algorithm's ``train`` has there.
+
+        What programs do not cover, such as images or gSDE, SB3 trains.
+        """
+        try:
+            self._train_fused(*args, **kwargs)
+        except NotCovered as why:
+            self._not_covered(why)
+            super().train(*args, **kwargs)  # type: ignore[misc]
+
+    @abstractmethod
+    def _train_fused(self, *args: Any, **kwargs: Any) -> None:
+        """A round of gradient steps.
+
+        :raises NotCovered: before it has begun, if programs do not cover them
         """
 
     def why_not_fused(self) -> str | None:

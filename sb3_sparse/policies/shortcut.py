@@ -68,7 +68,7 @@ class Shortcut:
         ]
         around = list({id(module): module for module in (*around, *extractors)}.values())
         known = all(type(module).__module__.partition(".")[0] in KNOWN for module in around[1:])
-        self._flat = takes_vectors(root) and all(map(_only_flattens, extractors))
+        self._flat = takes_vectors(root) and all(map(only_flattens, extractors))
         self._direct = self._flat and untouched(root, PREDICTS)
         if self._flat:
             around += [module for extractor in extractors for module in extractor.children()]
@@ -115,7 +115,7 @@ def takes_vectors(root: BaseModel) -> bool:
     return isinstance(space, spaces.Box) and not is_image_space(space)
 
 
-def _only_flattens(extractor: nn.Module) -> bool:
+def only_flattens(extractor: nn.Module) -> bool:
     """Whether it does no more than SB3's own for vectors."""
     flatten: Any = extractor._modules.get("flatten")
     return (
