@@ -16,18 +16,23 @@ from sb3_sparse.engine.native import library
 ROOT = Path(__file__).parents[2]
 
 
-@pytest.mark.skipif(
-    shutil.which("gcc") is None, reason="needs gcc (apt install gcc) for its address sanitizer"
-)
-@pytest.mark.parametrize("instructions", library.instruction_sets())
-def test_fused_steps_stay_within_bounds_under_the_address_sanitizer(tmp_path, instructions):
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """The kernels, watched by the address sanitizer."""
+    if shutil.which("gcc") is None:
+        pytest.skip("needs gcc (apt install gcc) for its address sanitizer")
     spec = importlib.util.spec_from_file_location("hatch_build", ROOT / "hatch_build.py")
     hook = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(hook)
-    made = tmp_path / "kernels.so"
+    path = tmp_path_factory.mktemp("watched") / "kernels.so"
     hook.compile_kernels(
-        ROOT / "sb3_sparse" / "engine" / "native", made, ("-fsanitize=address", "-g", "-O1")
+        ROOT / "sb3_sparse" / "engine" / "native", path, ("-fsanitize=address", "-g", "-O1")
     )
+    return path
+
+
+@pytest.mark.parametrize("instructions", library.instruction_sets())
+def test_fused_steps_stay_within_bounds_under_the_address_sanitizer(made, instructions):
     runtime = subprocess.run(
         ["gcc", "-print-file-name=libasan.so"], check=True, capture_output=True, text=True
     ).stdout.strip()
@@ -43,4 +48,5 @@ def test_fused_steps_stay_within_bounds_under_the_address_sanitizer(tmp_path, in
 
     done = run()
     assert done.stdout.split("\n")[-2:] == ["within bounds", ""], done.stderr[-3000:]
-    assert "AddressSanitizer: heap-buffer-overflow" in run("broken").stderr
+    if instructions == library.instruction_sets()[0]:
+        assert "AddressSanitizer: heap-buffer-overflow" in run("broken").stderr
