@@ -7,9 +7,20 @@ import pytest
 import support  # noqa: F401  (registers environments and a third-party method)
 import torch as th
 
+from sb3_sparse.engine.native import library
+
 th.set_num_threads(1)
 # A suite that a script starts in the background ignores Ctrl-C, and what it starts would, too.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.fixture(params=library.instruction_sets() if library.why_missing() is None else [])
+def instructions(request):
+    """One instruction set after the other."""
+    before = library.in_use()
+    library.use(request.param)
+    yield request.param
+    library.use(before)
 
 
 @pytest.fixture(autouse=True)

@@ -86,8 +86,8 @@ class TorchCQL(DQN):
                 wanted = data.rewards + (1 - data.dones) * self.gamma * next_q
             q = self.q_net(data.observations)
             taken = q.gather(1, data.actions)
-            distrust = (q.logsumexp(dim=1, keepdim=True) - taken).mean()
-            loss = th.nn.functional.smooth_l1_loss(taken, wanted) + 0.5 * distrust
+            penalty = (q.logsumexp(dim=1, keepdim=True) - taken).mean()
+            loss = th.nn.functional.smooth_l1_loss(taken, wanted) + 0.5 * penalty
             self.policy.optimizer.zero_grad()
             loss.backward()
             th.nn.utils.clip_grad_norm_(self.policy.parameters(), self.max_grad_norm)

@@ -26,31 +26,13 @@ class A2C(OnPolicy, stable_baselines3.A2C):
         advantages = program.input("advantages", 1)
         if self.normalize_advantage:
             advantages = self._normalised(advantages)
-        policy_loss = -(advantages * log_prob).mean()
-        value_loss = (program.input("returns", 1) - values).square().mean()
-        entropy_loss = -(entropy.mean() if entropy.batched else entropy)
-        for name, loss in (
-            ("policy_loss", policy_loss), ("value_loss", value_loss), ("entropy_loss", entropy_loss)
-        ):  # fmt: skip
-            program.log(name, loss)
-        loss = (
-            policy_loss
-            + program.scalar("ent_coef") * entropy_loss
-            + program.scalar("vf_coef") * value_loss
-        )
-        program.minimise(loss, self.policy.optimizer, clip=program.scalar("max_grad_norm"))
+        self._minimise(program, -(advantages * log_prob).mean(), values, entropy)
 
     def _train_fused(self) -> None:
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
         machine = self._next_machine()
-        machine.set(
-            {
-                "ent_coef": self.ent_coef,
-                "vf_coef": self.vf_coef,
-                "max_grad_norm": self.max_grad_norm,
-            }
-        )
+        machine.set(self._coefficients())
         for part in self._minibatches(None):
             self._hand_over(machine, part)
             machine.run(0, None, partial(self._refuse, part))

@@ -32,9 +32,9 @@ class DQN(OffPolicy, stable_baselines3.DQN):
         """One gradient step."""
         batch = self._record_transitions(program, source, self.q_net.features_dim, 1)
         next_q = program.network(parts(self.q_net_target.q_net), batch.next_obs).max_features()
-        wanted = batch.rewards + batch.going_on * batch.discounts * next_q
+        target_q = batch.rewards + batch.not_done * batch.discounts * next_q
         q = program.network(parts(self.q_net.q_net), batch.obs).pick(batch.actions)
-        loss = (q - wanted.detach()).huber().mean()
+        loss = (q - target_q.detach()).huber().mean()
         program.log("loss", loss)
         program.minimise(loss, self.policy.optimizer, clip=program.scalar("max_grad_norm"))
 

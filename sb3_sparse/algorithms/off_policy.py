@@ -28,8 +28,8 @@ class Transitions(NamedTuple):
     next_obs: Value
     actions: Value
     rewards: Value
-    going_on: Value
-    """0 where the episode has ended."""
+    not_done: Value
+    """0 where the episode has ended, else 1."""
     discounts: Value
 
 

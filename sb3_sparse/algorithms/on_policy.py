@@ -24,14 +24,9 @@ from sb3_sparse.fused.values import Value
 from sb3_sparse.policies.shortcut import takes_vectors
 
 METHODS: dict[str, tuple[str, ...]] = {
-    "": (
-        "evaluate_actions",
-        "extract_features",
-        "_get_action_dist_from_latent",
-    ),
+    "": ("evaluate_actions", "extract_features", "_get_action_dist_from_latent"),
     "mlp_extractor": ("forward", "forward_actor", "forward_critic"),
 }
-
 
 KNOWN[RMSpropTFLike] = Known(
     ("lr", "alpha", "eps", "weight_decay", "momentum", "centered"), rmsprop(2), ("", "square_avg")
@@ -75,9 +70,8 @@ class OnPolicy(Fused, OnPolicyAlgorithm):
         space = self.action_space
         if isinstance(space, spaces.Box):
             log_std = program.parameter(policy.log_std)
-            program.check(
-                program.constant(0.0) / log_std.exp(), "distribution"
-            )  # a deviation of 0 is none
+            # There is no Gaussian of deviation 0.
+            program.check(program.constant(0.0) / log_std.exp(), "distribution")
             actions = program.input("actions", head.features)
             log_prob, entropy = gaussian(head, log_std, actions)
         elif isinstance(space, spaces.Discrete):
@@ -94,11 +88,32 @@ class OnPolicy(Fused, OnPolicyAlgorithm):
             program.check(log_prob, "distribution")  # of infinite logits
         return values, log_prob, entropy
 
+    def _minimise(
+        self, program: Program, policy_loss: Value, values: Value, entropy: Value
+    ) -> None:
+        """Take a step down the losses of policy, value network and entropy together."""
+        value_loss = (program.input("returns", 1) - values).square().mean()
+        entropy_loss = -(entropy.mean() if entropy.batched else entropy)
+        loss = (
+            policy_loss
+            + program.scalar("ent_coef") * entropy_loss
+            + program.scalar("vf_coef") * value_loss
+        )
+        program.log("policy_loss", policy_loss)
+        program.log("value_loss", value_loss)
+        program.log("entropy_loss", entropy_loss)
+        program.log("loss", loss)
+        program.minimise(loss, self.policy.optimizer, clip=program.scalar("max_grad_norm"))
+
+    def _coefficients(self) -> dict[str, float]:
+        """The numbers of :meth:`_minimise`."""
+        return {name: getattr(self, name) for name in ("ent_coef", "vf_coef", "max_grad_norm")}
+
     @staticmethod
     def _normalised(advantages: Value) -> Value:
         centred = advantages - advantages.mean()
-        return centred / ((centred.square().sum() / advantages.program.scalar("batch - 1")).sqrt()
-                          + 1e-8)  # fmt: skip
+        variance = centred.square().sum() / advantages.program.scalar("batch - 1")
+        return centred / (variance.sqrt() + 1e-8)
 
     def _minibatches(self, size: int | None) -> Iterator[Minibatch]:
         """The rollout in parts, of the same random numbers as SB3.

@@ -55,41 +55,26 @@ class PPO(OnPolicy, stable_baselines3.PPO):
         bound = program.scalar("clip_range")
         within = advantages * ratio.clamp(1.0 - bound, 1.0 + bound)
         policy_loss = -(advantages * ratio).least(within).mean()
-        program.log("policy_loss", policy_loss)
         program.log("clip_fraction", bound.less((ratio - 1.0).abs()).mean())
         program.log("approx_kl", (ratio - 1.0 - log_ratio).mean())
         if clipped:
             old = program.input("old_values", 1)
             most = program.scalar("clip_range_vf")
             values = old + (values - old).clamp(-most, most)
-        value_loss = (program.input("returns", 1) - values).square().mean()
-        program.log("value_loss", value_loss)
-        entropy_loss = -(entropy.mean() if entropy.batched else entropy)
-        program.log("entropy_loss", entropy_loss)
-        loss = (
-            policy_loss
-            + program.scalar("ent_coef") * entropy_loss
-            + program.scalar("vf_coef") * value_loss
-        )
-        program.log("loss", loss)
-        program.minimise(loss, self.policy.optimizer, clip=program.scalar("max_grad_norm"))
+        self._minimise(program, policy_loss, values, entropy)
 
     def _train_fused(self) -> None:
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
         remaining = self._current_progress_remaining
-        settings = {
-            "clip_range": self.clip_range(remaining),  # type: ignore[operator]
-            "ent_coef": self.ent_coef,
-            "vf_coef": self.vf_coef,
-            "max_grad_norm": self.max_grad_norm,
-        }
+        clip_range = self.clip_range(remaining)  # type: ignore[operator]
+        settings = {**self._coefficients(), "clip_range": clip_range}
         if self.clip_range_vf is not None:
             settings["clip_range_vf"] = self.clip_range_vf(remaining)  # type: ignore[operator]
         self._next_machine()  # before anything is drawn
 
         logged = defaultdict(list)
-        going_on = True
+        continue_training = True
         for epoch in range(self.n_epochs):
             divergences = []
             for part in self._minibatches(self.batch_size):
@@ -104,7 +89,7 @@ class PPO(OnPolicy, stable_baselines3.PPO):
                 divergences.append(np.float32(divergence))
                 loss = machine.number("loss")
                 if self.target_kl is not None and divergence > 1.5 * self.target_kl:
-                    going_on = False
+                    continue_training = False
                     if self.verbose >= 1:
                         print(
                             f"Early stopping at step {epoch} due to reaching max kl: "
@@ -114,7 +99,7 @@ class PPO(OnPolicy, stable_baselines3.PPO):
                 if step is not None:
                     machine.run(step)
             self._n_updates += 1
-            if not going_on:
+            if not continue_training:
                 break
 
         record = self.logger.record

@@ -86,10 +86,10 @@ class SAC(OffPolicy, stable_baselines3.SAC):
         before = program.joined([batch.next_obs, next_action])
         next_q = least_of([program.network(parts(q), before) for q in target.q_networks])
         next_value = next_q - ent_coef * next_log_prob
-        wanted = batch.rewards + batch.going_on * batch.discounts * next_value
+        target_q = batch.rewards + batch.not_done * batch.discounts * next_value
         taken = program.joined([batch.obs, batch.actions])
         losses = [
-            (program.network(parts(q), taken) - wanted.detach()).square().mean()
+            (program.network(parts(q), taken) - target_q.detach()).square().mean()
             for q in critic.q_networks
         ]
         critic_loss = sum(losses[1:], losses[0]) * 0.5
@@ -101,9 +101,9 @@ class SAC(OffPolicy, stable_baselines3.SAC):
         actor_loss = (ent_coef * log_prob - q).mean()
         program.log("actor_loss", actor_loss)
         program.minimise(actor_loss, actor.optimizer)
-        program.mark("followed")
+        program.mark("target update")
         for one, two in zip(critic.q_networks, target.q_networks, strict=True):
-            program.follow(parts(one), parts(two), program.scalar("tau"))
+            program.polyak_update(parts(one), parts(two), program.scalar("tau"))
 
     def _train_fused(self, gradient_steps: int, batch_size: int = 64) -> None:
         self.policy.set_training_mode(True)
@@ -118,7 +118,9 @@ class SAC(OffPolicy, stable_baselines3.SAC):
             machine.set({"target_entropy": float(self.target_entropy), "tau": self.tau})
             if self.ent_coef_optimizer is None:
                 machine.set({"ent_coef": float(self.ent_coef_tensor)})
-            last = None if step % self.target_update_interval == 0 else machine.marks["followed"]
+            last = (
+                None if step % self.target_update_interval == 0 else machine.marks["target update"]
+            )
             machine.run(0, last, partial(self._refuse, machine, data))
             for name in machine.program.logged:
                 logged.setdefault(name, []).append(machine.number(name))

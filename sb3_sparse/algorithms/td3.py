@@ -53,10 +53,10 @@ class TD3(OffPolicy, stable_baselines3.TD3):
         before = program.joined([batch.next_obs, next_action])
         targets = self.critic_target.q_networks
         next_q = least_of([program.network(parts(q), before) for q in targets])
-        wanted = (batch.rewards + batch.going_on * batch.discounts * next_q).detach()
+        target_q = (batch.rewards + batch.not_done * batch.discounts * next_q).detach()
         taken = program.joined([batch.obs, batch.actions])
         losses = [
-            (program.network(parts(q), taken) - wanted).square().mean()
+            (program.network(parts(q), taken) - target_q).square().mean()
             for q in self.critic.q_networks
         ]
         critic_loss = sum(losses[1:], losses[0])
@@ -71,8 +71,8 @@ class TD3(OffPolicy, stable_baselines3.TD3):
         program.minimise(actor_loss, self.actor.optimizer)
         tau = program.scalar("tau")
         for one, two in zip(self.critic.q_networks, targets, strict=True):
-            program.follow(parts(one), parts(two), tau)
-        program.follow(parts(self.actor.mu), parts(self.actor_target.mu), tau)
+            program.polyak_update(parts(one), parts(two), tau)
+        program.polyak_update(parts(self.actor.mu), parts(self.actor_target.mu), tau)
 
     def _train_fused(self, gradient_steps: int, batch_size: int = 100) -> None:
         self.policy.set_training_mode(True)

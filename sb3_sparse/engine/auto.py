@@ -84,8 +84,15 @@ def pays(size: int, nnz: int) -> bool:
     :param size: connections of the dense layer
     :param nnz: active ones
     """
-    if size < LARGE:
-        return False
+    return size >= LARGE and sparse_enough(size, nnz)
+
+
+def sparse_enough(size: int, nnz: int) -> bool:
+    """Whether products with the non-zeros of a layer are quicker than dense ones.
+
+    :param size: connections of the dense layer
+    :param nnz: active ones
+    """
     if in_use() not in WITH_VECTORS:
         return nnz <= size / 4
     return nnz <= (size / 2 if size <= HUGE else size * 2 / 5)

@@ -25,7 +25,7 @@ from sb3_sparse.engine.activations import ADJUSTABLE, number_of
 from sb3_sparse.engine.chains import watched, watching
 from sb3_sparse.engine.linear import TRIES, CompactLinear
 from sb3_sparse.engine.masked import FLOAT_MASK_KEY, MaskedLayer
-from sb3_sparse.engine.native.library import bits_of, library, why_missing
+from sb3_sparse.engine.native.library import bits_of, library, readable, why_missing
 from sb3_sparse.engine.paths import Paths, modules_of, parts_of
 from sb3_sparse.engine.room import Room
 from sb3_sparse.engine.structure import Structure
@@ -275,7 +275,7 @@ class Inference:
                 place = 0
                 if tensor is not None:
                     now = next(held)
-                    if now.shape != size or not _readable(now):
+                    if now.shape != size or not readable(now):
                         return None
                     place = now.data_ptr()
                 places.append(place)
@@ -292,7 +292,3 @@ class Inference:
 def _tensors_of(layer: nn.Linear) -> tuple[th.Tensor | None, ...]:
     """Weight, bias and mask."""
     return layer.weight, layer.bias, layer._buffers.get(FLOAT_MASK_KEY)
-
-
-def _readable(tensor: th.Tensor) -> bool:
-    return tensor.dtype == th.float32 and tensor.is_cpu and tensor.is_contiguous()

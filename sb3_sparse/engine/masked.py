@@ -15,7 +15,7 @@ from sb3_sparse.engine.gradients import DenseGradient, GradientMask, weakly
 from sb3_sparse.engine.kernels import Kernel
 from sb3_sparse.engine.layers import SparseLayer, moments_of
 from sb3_sparse.engine.linear import MASK_KEY
-from sb3_sparse.engine.native.library import library, why_missing
+from sb3_sparse.engine.native.library import library, readable, why_missing
 
 FLOAT_MASK_KEY = "weight_mask_float"
 
@@ -33,14 +33,10 @@ def clear(weight: th.Tensor, mask: th.Tensor) -> None:
     Torch counts no write, so that a graph that is alive, perhaps in another thread, goes on to be
     valid.
     """
-    if why_missing() is None and all(map(_is_plain, (weight, mask))):
+    if why_missing() is None and readable(weight) and readable(mask):
         library().sb3_sparse_clear(weight.data_ptr(), mask.data_ptr(), weight.numel())
     else:
         weight.data.mul_(mask)
-
-
-def _is_plain(tensor: th.Tensor) -> bool:
-    return tensor.is_cpu and tensor.dtype is th.float32 and tensor.is_contiguous()
 
 
 class MaskedLayer(SparseLayer):

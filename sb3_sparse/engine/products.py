@@ -16,7 +16,7 @@ from torch import nn
 from torch.nn import functional
 
 from sb3_sparse.engine.activations import number_of
-from sb3_sparse.engine.native.library import BatchArgument, bits_of, library
+from sb3_sparse.engine.native.library import BatchArgument, bits_of, library, readable
 from sb3_sparse.engine.structure import Structure
 from sb3_sparse.errors import UnsupportedError
 
@@ -67,7 +67,7 @@ class Pass(NamedTuple):
         for i, structure in enumerate(self.structures):
             values, bias = parameters[2 * i : 2 * i + 2]
             for parameter in (values, bias):
-                if parameter is not None and not _readable(parameter):
+                if parameter is not None and not readable(parameter):
                     raise UnsupportedError(
                         "weights and biases of layers that compute on non-zeros must be "
                         f"contiguous float32 on the CPU, got {parameter.dtype} on "
@@ -153,14 +153,6 @@ class Pass(NamedTuple):
             x = functional.pad(x, (0, 0, 0, tiles_of(self.batch) * TILE - self.batch))
             x = x.view(-1, TILE, self.rows).transpose(1, 2)
         return x
-
-
-def _readable(parameter: th.Tensor) -> bool:
-    return (
-        parameter.dtype == th.float32
-        and parameter.device.type == "cpu"
-        and parameter.is_contiguous()
-    )
 
 
 class Products(th.autograd.Function):

@@ -7,7 +7,7 @@ from typing import Any
 import torch as th
 
 from sb3_sparse.fused.errors import NotCovered
-from sb3_sparse.fused.recording import Behind, Recording
+from sb3_sparse.fused.recording import Behind, Minimised, Recording
 from sb3_sparse.fused.values import Value
 
 
@@ -130,7 +130,7 @@ class Descent:
         if clip is not None:
             program.record("CLIP_NORM", Value(program, 1, False), clip, **common)
         step = program.record("OPTIMIZE", None, **common, changes=True)
-        program.finish_step(self._optimizer, slots, step, self._captured)
+        program.minimised.append(Minimised(self._optimizer, slots, step, self._captured))
         # A loss to come reads them anew.
         program.turned.difference_update(self._layers)
         for key in self._wanted:

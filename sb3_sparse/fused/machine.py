@@ -11,8 +11,9 @@ import torch as th
 
 from sb3_sparse.engine.controller import Controller
 from sb3_sparse.engine.native.library import bits_of, library
+from sb3_sparse.engine.products import TILE
 from sb3_sparse.fused.inputs import Inputs
-from sb3_sparse.fused.memory import TILE, Memory, Place
+from sb3_sparse.fused.memory import Memory, Place
 from sb3_sparse.fused.operations import KINDS, in_phases
 from sb3_sparse.fused.program import Program
 from sb3_sparse.fused.recording import Minimised
@@ -185,7 +186,7 @@ class Machine:
         self._repack()
 
     def _repack(self) -> None:
-        """Read anew what layers compute with; their weights were written elsewhere."""
+        """Read anew what layers compute with: weights were written, or lie elsewhere now."""
         for i, operation in enumerate(self.operations):
-            if operation.kind == "PACK":
+            if operation.kind in ("PACK", "TURN"):  # in this order, since weights come first
                 self._go(i, i + 1)

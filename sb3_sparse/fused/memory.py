@@ -8,10 +8,9 @@ from typing import NamedTuple
 
 import torch as th
 
+from sb3_sparse.engine.products import TILE
 from sb3_sparse.fused.operations import Operation
 from sb3_sparse.fused.values import Value
-
-TILE = 64
 
 
 class Place(NamedTuple):

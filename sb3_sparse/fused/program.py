@@ -11,11 +11,11 @@ from sb3_sparse.engine.activations import number_of, tells_its_slope
 from sb3_sparse.fused.descent import Descent
 from sb3_sparse.fused.errors import NotCovered
 from sb3_sparse.fused.operations import Operation
-from sb3_sparse.fused.recording import NUMBERS, Behind, Recording
+from sb3_sparse.fused.recording import Behind, Recording
 from sb3_sparse.fused.values import Value
 
 WITH_SLOPE_AT_INPUT = (nn.SiLU, nn.GELU)
-RELU = NUMBERS["RELU"]
+RELU, _, _ = number_of(nn.ReLU())
 Parts = Sequence[tuple[nn.Linear, nn.Module | None]]
 
 
@@ -94,13 +94,11 @@ class Program(Recording):
     def _activation(self, module: nn.Module, z: Value) -> Value:
         if type(module) not in WITH_SLOPE_AT_INPUT:
             raise NotCovered(f"the activation {type(module).__name__}")
-        kind, p, q = number_of(module)
-        made = Value(self, z.features, True)
-        self.record("ACTIVATION", made, z, number=kind, p=p, q=q)
+        made = self.activated(z, module)
 
         def back(g: Value) -> Value:
             sloped = Value(self, z.features, True)
-            self.record("SLOPE_INPUT", sloped, g, z, number=kind)
+            self.record("SLOPE_INPUT", sloped, g, z, number=number_of(module)[0])
             return sloped
 
         made.parents = ((z, back),)
@@ -168,7 +166,7 @@ class Program(Recording):
         """
         Descent(self, optimizer).record(loss, clip)
 
-    def follow(self, network: Parts, target_network: Parts, tau: Value) -> None:
+    def polyak_update(self, network: Parts, target_network: Parts, tau: Value) -> None:
         """Let a target network follow by Polyak averaging.
 
         :param tau: share of the network

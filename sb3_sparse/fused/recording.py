@@ -9,11 +9,9 @@ from typing import Any, NamedTuple
 import torch as th
 from torch import nn
 
+from sb3_sparse.engine.activations import number_of
 from sb3_sparse.fused.operations import Operation
 from sb3_sparse.fused.values import Number, Value
-
-NUMBERS = {"RELU": 1, "TANH": 2, "SIGMOID": 3, "SOFTPLUS": 11}
-"""Activations by the name that losses use; numbers of ``kernels.h``."""
 
 
 @dataclass
@@ -112,10 +110,11 @@ class Recording:
         """The value, or that of a number."""
         return number if isinstance(number, Value) else self.constant(float(number))
 
-    def activated(self, x: Value, name: str, p: float = 0.0, q: float = 0.0) -> Value:
+    def activated(self, x: Value, activation: nn.Module) -> Value:
         """An activation of ``x``; whoever asks for it knows its gradient."""
         made = Value(self, x.features, x.batched)
-        self.record("ACTIVATION", made, x, number=NUMBERS[name], p=p, q=q)
+        kind, p, q = number_of(activation)
+        self.record("ACTIVATION", made, x, number=kind, p=p, q=q)
         return made
 
     def slot(
@@ -124,13 +123,3 @@ class Recording:
         """A row of the table of parameters; its number."""
         self.slots.append(Slot(tensor, layer, optimizer))
         return len(self.slots) - 1
-
-    def finish_step(
-        self,
-        optimizer: th.optim.Optimizer,
-        slots: tuple[int, int],
-        step: Operation,
-        captured: bool,
-    ) -> None:
-        """Note that an optimizer takes a step."""
-        self.minimised.append(Minimised(optimizer, slots, step, captured))

@@ -9,22 +9,21 @@ import numpy as np
 import torch as th
 from torch import nn
 
+from sb3_sparse.engine.auto import sparse_enough
 from sb3_sparse.engine.controller import Controller
 from sb3_sparse.engine.layers import SparseLayer
 from sb3_sparse.engine.linear import CompactLinear
 from sb3_sparse.engine.masked import MaskedLayer
+from sb3_sparse.engine.native.library import readable
 from sb3_sparse.engine.structure import Structure
 from sb3_sparse.fused.errors import NotCovered
-
-SPARSE_ENOUGH = 0.5
-"""Density up to which a masked layer is computed by its connections."""
 
 
 class Stored(NamedTuple):
     """A weight as it is now.
 
     :param numbers: what the kernels read and optimizers move
-    :param structure: connections; None: the weight is read as a matrix
+    :param structure: connections; None: the weight is read as a matrix, as it is without zeros
     :param flat: where each connection stands in ``numbers``, int32; None: one after the other
     :param mask: of a matrix, 0 where inactive; None: all count
     :param layer: the sparse layer whose weight it is; None: it is a target's, or not sparse
@@ -92,13 +91,15 @@ class Storage:
             if follows and structure is not module.structure:
                 raise NotCovered("a target with other connections than its layer")
             check_readable(values)
-            return Stored(values, structure, layer=self._layers.get(id(module)))
+            layer = self._layers.get(id(module))
+            full = structure.nnz == module.out_features * module.in_features
+            return Stored(values, None if full else structure, layer=layer)
         weight = module.weight
         check_readable(weight)
         layer = self._layers.get(id(module)) or self._targets.get(id(module))
         if not isinstance(layer, MaskedLayer) or layer.full:
             return Stored(weight, layer=self._layers.get(id(module)))
-        sparse = layer.nnz <= SPARSE_ENOUGH * layer.size
+        sparse = sparse_enough(layer.size, layer.nnz)
         if id(module) in self._layers:
             if not sparse:
                 return Stored(weight, mask=layer.float_mask, layer=layer)
@@ -138,5 +139,5 @@ def check_readable(tensor: th.Tensor) -> None:
 
     :raises NotCovered: for anything but contiguous float32 on the CPU
     """
-    if tensor.dtype != th.float32 or not tensor.is_cpu or not tensor.is_contiguous():
+    if not readable(tensor):
         raise NotCovered(f"a parameter of {tensor.dtype} on {tensor.device}")

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Protocol, Union
 
+from torch import nn
+
 Number = Union["Value", float]
 Back = Callable[["Value"], "Value"]
 """The share of a parent in the gradient of a value."""
@@ -27,7 +29,7 @@ class Recorder(Protocol):
     def value(self, number: Number) -> Value:
         """The value, or that of a number."""
 
-    def activated(self, x: Value, name: str, p: float = 0.0, q: float = 0.0) -> Value:
+    def activated(self, x: Value, activation: nn.Module) -> Value:
         """An activation of ``x``."""
 
 
@@ -187,19 +189,19 @@ class Value:
 
     def tanh(self) -> Value:
         """The hyperbolic tangent."""
-        made = self.program.activated(self, "TANH")
+        made = self.program.activated(self, nn.Tanh())
         made.parents = ((self, lambda g: g * (1.0 - made.square())),)
         return made
 
     def sigmoid(self) -> Value:
         """``1 / (1 + e^-x)``."""
-        made = self.program.activated(self, "SIGMOID")
+        made = self.program.activated(self, nn.Sigmoid())
         made.parents = ((self, lambda g: g * (made * (1.0 - made))),)
         return made
 
     def softplus(self) -> Value:
         """``log(1 + e^x)``."""
-        made = self.program.activated(self, "SOFTPLUS", 1.0, 20.0)
+        made = self.program.activated(self, nn.Softplus())
         made.parents = ((self, lambda g: g * self.sigmoid()),)
         return made
 

@@ -5,10 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch as th
+from algorithms_support import make
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
 
+import sb3_sparse
+from sb3_sparse.algorithms.training import parts
 from sb3_sparse.engine.controller import Controller
 from sb3_sparse.fused.machine import Machine
 from sb3_sparse.fused.operations import Operation, in_phases
@@ -197,3 +200,33 @@ def test_phases_keep_what_depends_on_each_other_in_order(recorded):
             reads = any(operand is other.to for operand in operation.operands)
             if reads or other.changes or operation.changes:
                 assert place[id(other)] < place[id(operation)]
+
+
+@pytest.mark.parametrize("compute", ["masked", "sparse"])
+def test_a_network_that_two_losses_pass_through_while_an_optimizer_begins(compute):
+    """Torch takes the first step, which makes moments; the second loss needs the network still."""
+    policy = make(sb3_sparse, "DQN", policy_kwargs=dict(compute=compute)).policy
+    net = policy.q_net.q_net
+    size = net[0].in_features
+    x = th.randn(70, size)
+    moved = {}
+    for way in ("torch", "fused"):
+        vectors = [th.nn.Parameter(th.ones(size)) for _ in range(2)]
+        optimizers = [th.optim.Adam([vector], lr=0.1) for vector in vectors]
+        if way == "torch":
+            for vector, optimizer in zip(vectors, optimizers, strict=True):
+                net(x * vector).square().mean().backward()
+                optimizer.step()
+        else:
+            program = Program()
+            inputs = program.input("x", size)
+            for vector, optimizer in zip(vectors, optimizers, strict=True):
+                result = program.network(parts(net), inputs * program.parameter(vector))
+                program.minimise(result.square().mean(), optimizer)
+            machine = Machine(program, policy.sparse, len(x))
+            machine.prepare()
+            machine.load({"x": x})
+            machine.run()
+        moved[way] = vectors
+    assert all((vector != 1).all() for vector in moved["torch"])
+    th.testing.assert_close(moved["fused"], moved["torch"])

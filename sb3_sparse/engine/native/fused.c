@@ -355,14 +355,25 @@ static int has_nan(const program_t *program, const operation_t *o) {
     return 0;
 }
 
+static double sum_of_squares(const float *x, int64_t count) {
+    double sum = 0;
+    int64_t k = 0;
+    while (k + WIDTH <= count) { /* in parts, which keeps small ones */
+        vec part = {0};
+        for (int64_t end = k + 64 * WIDTH; k < end && k + WIDTH <= count; k += WIDTH)
+            part += LOAD(x + k) * LOAD(x + k);
+        sum += total(part);
+    }
+    for (; k < count; k++) sum += x[k] * x[k];
+    return sum;
+}
+
 /* Scales gradients of parameters first..last so that their norm is at most that of `a`. */
 static void clip_norm(const program_t *program, const operation_t *o) {
     double sum = 0;
     for (int64_t i = o->first; i < o->last; i++) {
         const parameter_t *p = program->parameters + i;
-        float part = 0;
-        for (int64_t k = 0; k < p->count; k++) part += p->grad[k] * p->grad[k];
-        sum += part;
+        sum += sum_of_squares(p->grad, p->count);
     }
     float norm = (float)sqrt(sum), factor = *o->a.base / (norm + 1e-6f);
     set_lanes(o->to.base, norm);
@@ -381,11 +392,12 @@ static void mask_grads(const program_t *program, const operation_t *o) {
     }
 }
 
+/* What a step does to every number. */
 typedef struct {
-    vec first, kept, second, forgotten, squared, rate, root, epsilon, decay, shrink;
-} adam_t;
+    vec first, second, squared, rate, root, epsilon, decay, shrink;
+} rule_t;
 
-INLINE void adam(const adam_t *s, vec *p, vec *m, vec *v, vec g) {
+INLINE void adam(const rule_t *s, vec *p, vec *m, vec *v, vec g) {
     *p *= s->shrink;
     if (s->decay[0] != 0) g += s->decay * *p; /* 0 times infinity is no 0 */
     *m += s->first * (g - *m);
@@ -393,7 +405,7 @@ INLINE void adam(const adam_t *s, vec *p, vec *m, vec *v, vec g) {
     *p -= s->rate * *m / (root_of(*v) / s->root + s->epsilon);
 }
 
-INLINE void rmsprop(const adam_t *s, int within, vec *p, vec *v, vec g) {
+INLINE void rmsprop(const rule_t *s, int within, vec *p, vec *v, vec g) {
     if (s->decay[0] != 0) g += s->decay * *p;
     *v = s->second * *v + s->squared * (g * g);
     *p -= s->rate * g / (within ? root_of(*v + s->epsilon) : root_of(*v) + s->epsilon);
@@ -407,7 +419,7 @@ static void step_parameter(const parameter_t *p, const group_t *group) {
         root = sqrt(1 - pow(group->beta2, t));
     }
 #define FLOATS(x) ((float)(x) + (vec){0})
-    adam_t s = {
+    rule_t s = {
         .first = FLOATS(1 - group->beta1), .second = FLOATS(group->beta2),
         .squared = FLOATS(1 - group->beta2), .rate = FLOATS(rate), .root = FLOATS(root),
         .epsilon = FLOATS(group->epsilon), .decay = FLOATS(decay),

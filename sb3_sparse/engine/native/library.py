@@ -114,6 +114,11 @@ def why_missing() -> str | None:
     return None
 
 
+def readable(tensor: th.Tensor) -> bool:
+    """Whether the kernels can read and write a tensor where it lies."""
+    return tensor.dtype is th.float32 and tensor.is_cpu and tensor.is_contiguous()
+
+
 def instruction_sets() -> list[str]:
     """The instruction sets that run here, the best first."""
     found = library()
