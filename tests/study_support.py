@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import yaml
 
-from sb3_sparse.experiments import Study, run_study
 from sb3_sparse.launch.base import Ended, Launcher, Task
+from sb3_sparse.studies import Study, run_study
 
 QUICK = {
     "n_timesteps": 300,

@@ -13,7 +13,7 @@ PACKAGE = ROOT / "sb3_sparse"
 # From the top; parts on one line may not import each other either.
 FLOORS = [
     {"cli", "rl_zoo_optimize"},
-    {"report", "experiments", "tuning"},
+    {"report", "studies", "tuning"},
     {"zoo", "analysis", "export", "compress", "launch"},
     {"callback", "algorithms"},
     {"policies"},

@@ -11,8 +11,8 @@ from pkgutil import iter_modules
 
 import pytest
 
-from sb3_sparse.experiments.blocks import SCALES, planned_runs, study_names
-from sb3_sparse.experiments.spec import Study
+from sb3_sparse.studies.blocks import SCALES, planned_runs, study_names
+from sb3_sparse.studies.spec import Study
 
 HEAVY = ["torch", "stable_baselines3", "sb3_contrib", "rl_zoo3", "optuna", "matplotlib", "pandas"]
 
@@ -170,7 +170,7 @@ def test_the_test_of_imports_sees_what_the_patching_module_does(tmp_path):
     assert {name.rpartition("Experiment")[2] for name in replaced} == {"Manager.objective"}
 
 
-@pytest.mark.parametrize("package", ["", ".experiments", ".export", ".tuning"])
+@pytest.mark.parametrize("package", ["", ".studies", ".export", ".tuning"])
 def test_names_that_are_imported_as_needed_are_no_modules(package):
     module = import_module(f"sb3_sparse{package}")
     modules = {one.name for one in iter_modules(module.__path__)}

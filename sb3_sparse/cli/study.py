@@ -14,11 +14,11 @@ from rich.table import Table
 from sb3_sparse.cli.common import INTERRUPTED, Address, GymPackages, Launcher, console, text
 from sb3_sparse.cli.studyprogress import StudyProgress
 from sb3_sparse.errors import ConfigError, MissingExtra, command
-from sb3_sparse.experiments import Study
 from sb3_sparse.launch import launcher_named
+from sb3_sparse.studies import Study
 
 if TYPE_CHECKING:
-    from sb3_sparse.experiments.standing import CellStanding
+    from sb3_sparse.studies.status import CellStatus
 
 OVER = ("done", "diverged")
 studies = typer.Typer(no_args_is_help=True)
@@ -44,7 +44,7 @@ Store = Annotated[Path, text("Where runs and reports go; studies share it.", "--
 @studies.command("list")
 def list_() -> None:
     """Every study that comes with the package."""
-    from sb3_sparse.experiments.blocks import SCALES, planned_runs, study_names, title_of
+    from sb3_sparse.studies.blocks import SCALES, planned_runs, study_names, title_of
 
     table = Table("study", "what", *SCALES, box=None, header_style="bold")
     for name in study_names():
@@ -69,7 +69,7 @@ def run(
     asked = _Asked(name, scale, store, archive, gym_packages or [])
     chosen = launcher_named(launcher, address)
     study = asked.study()
-    from sb3_sparse.experiments import run_study  # not for a mistyped name
+    from sb3_sparse.studies import run_study  # not for a mistyped name
 
     if Path(name).suffix:
         _check_figures(study)
@@ -118,18 +118,18 @@ def status(
     """How far a study is, and which of its runs failed."""
     asked = _Asked(name, scale, store, archive, gym_packages or [])
     study = asked.study()
-    from sb3_sparse.experiments.standing import FAILED, RUNNING, STOPPED, counts
+    from sb3_sparse.studies.status import FAILED, RUNNING, STOPPED, counts
     from sb3_sparse.zoo.record import DIVERGED
 
-    standings = asked.standings(study)
+    statuses = asked.statuses(study)
     _say_merged(study)
-    found = counts(standings)
-    console.print(f"{study.title}, scale {scale}: {len(standings)} runs")
+    found = counts(statuses)
+    console.print(f"{study.title}, scale {scale}: {len(statuses)} runs")
     console.print(", ".join(f"{number} {what}" for what, number in found.items()))
-    done = Counter(one.cell.run.env_id for one in standings if one.status == "done")
-    for env_id, planned in Counter(one.cell.run.env_id for one in standings).items():
+    done = Counter(one.cell.run.env_id for one in statuses if one.status == "done")
+    for env_id, planned in Counter(one.cell.run.env_id for one in statuses).items():
         console.print(f"  {env_id}: {done[env_id]} of {planned}")
-    for one in standings:
+    for one in statuses:
         if one.status in (RUNNING, STOPPED):
             console.print(f"{one.status}: {one.cell.name}, {one.steps} steps")
         if one.status == DIVERGED:
@@ -155,9 +155,9 @@ def report(
     study = asked.study()
     from sb3_sparse.report import write_report
 
-    standings = asked.standings(study)
-    archived = {one.folder: one.archived for one in standings if one.archived is not None}
-    folders = [one.folder for one in standings if one.folder.is_dir()]
+    statuses = asked.statuses(study)
+    archived = {one.folder: one.archived for one in statuses if one.archived is not None}
+    folders = [one.folder for one in statuses if one.folder.is_dir()]
     if not folders and not archived:
         where = store if archive is None else f"{store} or {archive}"
         raise ConfigError(
@@ -171,7 +171,7 @@ def report(
         varies=study.varies,
         command=asked.command("run"),
         archived=archived,
-        pending=[_pending(one, store) for one in standings if one.status not in OVER],
+        pending=[_pending(one, store) for one in statuses if one.status not in OVER],
     )
     console.print(f"Written: {page}", soft_wrap=True)
 
@@ -192,7 +192,7 @@ def _check_figures(study: Study) -> None:
     check_figures(study.figures)
 
 
-def _pending(one: CellStanding, store: Path) -> str:
+def _pending(one: CellStatus, store: Path) -> str:
     why = one.reason or f"see {one.cell.errors(store)}"
     failed = f": failed, {why}" if one.status == "failed" else ""
     return f"{one.cell.name}{failed}"
@@ -211,12 +211,12 @@ class _Asked:
     def study(self) -> Study:
         return Study.read(self.name, self.scale, self.packages)
 
-    def standings(self, study: Study) -> list[CellStanding]:
-        from sb3_sparse.experiments import standing_of
+    def statuses(self, study: Study) -> list[CellStatus]:
+        from sb3_sparse.studies import status_of
         from sb3_sparse.zoo.archive import Archive
 
         lines = None if self.archive is None else Archive(self.archive).read()
-        return [standing_of(cell, self.store, lines) for cell in study.cells]
+        return [status_of(cell, self.store, lines) for cell in study.cells]
 
     def command(self, what: str, *more: str) -> str:
         """The same for another command."""

@@ -10,7 +10,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, TextColumn
 from rich.progress import Progress as Bars
 
 if TYPE_CHECKING:
-    from sb3_sparse.experiments import Progress
+    from sb3_sparse.studies import Progress
 
 
 class StudyProgress:

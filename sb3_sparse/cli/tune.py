@@ -163,24 +163,24 @@ def search(
     if write_into is not None and tuned.best is not None:
         merge(tuned.study, write_into)
         _say(f"Merged into {write_into}")
-    if not tuned.standing.finished:
+    if not tuned.status.finished:
         raise typer.Exit(1)
 
 
 def _print_outcome(run: Run, tuned: Tuned, storage: str | None, log_folder: Path) -> None:
     from sb3_sparse.tuning.urls import shown_url
 
-    standing, name = tuned.standing, tuned.study.study_name
+    status, name = tuned.status, tuned.study.study_name
     for worker, error in tuned.errors.items():
         _say(f"{worker}: {error.strip().splitlines()[-1]}")
-    done = f"{len(standing.done)} of {standing.planned} trials are done"
+    done = f"{len(status.done)} of {status.planned} trials are done"
     if not tuned.began:
         _say(f"The study {name} is finished: {done}. Nothing to do.")
-    elif standing.finished:
+    elif status.finished:
         _say(f"Study {name}: {done}.")
     else:
         _say(
-            f"Study {name}: {done}, {len(standing.failed)} failed; the logs of the workers are in "
+            f"Study {name}: {done}, {len(status.failed)} failed; the logs of the workers are in "
             f"{tuned.folder}. The same command goes on, and tries failed trials again."
         )
     if tuned.best is None or tuned.config is None:

@@ -9,7 +9,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 if TYPE_CHECKING:
     from sb3_sparse.tuning.backend import FrozenTrial
-    from sb3_sparse.tuning.study import Standing
+    from sb3_sparse.tuning.study import Status
 
 
 def values_in_words(trial: FrozenTrial) -> str:
@@ -41,34 +41,32 @@ class TuningProgress:
         )
         self.task = self.bar.add_task("", total=None, status="starting")
 
-    def __call__(self, standing: Standing) -> None:
+    def __call__(self, status: Status) -> None:
         """Show how far it is."""
         if self.seen is None:
-            self.seen = {trial.number for trial in standing.done}
+            self.seen = {trial.number for trial in status.done}
             self.bar.start()
-        over = [trial for trial in (*standing.done, *standing.failed)]
+        over = [trial for trial in (*status.done, *status.failed)]
         for trial in over:
             if trial.number not in self.seen:
                 self.seen.add(trial.number)
-                self.console.print(self._line(trial, standing), soft_wrap=True)
-        best = standing.best
-        status = "best –" if best is None else f"best {best.values[0]:.6g} (trial {best.number})"
-        running = f"{len(standing.running)} running, {status}"
-        self.bar.update(
-            self.task, completed=len(standing.done), total=standing.planned, status=running
-        )
+                self.console.print(self._line(trial, status), soft_wrap=True)
+        best = status.best
+        best_text = "best –" if best is None else f"best {best.values[0]:.6g} (trial {best.number})"
+        running = f"{len(status.running)} running, {best_text}"
+        self.bar.update(self.task, completed=len(status.done), total=status.planned, status=running)
 
     @staticmethod
-    def _line(trial: FrozenTrial, standing: Standing) -> str:
-        if trial in standing.failed:
+    def _line(trial: FrozenTrial, status: Status) -> str:
+        if trial in status.failed:
             return (
                 f"trial {trial.number} failed: {trial.user_attrs.get('error', 'no reason known')}"
             )
-        best = standing.best
-        how = "pruned at" if trial not in standing.complete else "score"
+        best = status.best
+        how = "pruned at" if trial not in status.complete else "score"
         value = f"{trial.values[0]:.6g}" if trial.values else "–"
         so_far = "" if best is None else f", best so far {best.values[0]:.6g} (trial {best.number})"
-        count = f"{len(standing.done)} of {standing.planned}"
+        count = f"{len(status.done)} of {status.planned}"
         return f"{count}: trial {trial.number} {how} {value}{so_far}; {values_in_words(trial)}"
 
     def close(self) -> None:

@@ -11,7 +11,7 @@ from sb3_sparse.loading.text import read_text
 from sb3_sparse.tuning.backend import FrozenTrial, optuna
 from sb3_sparse.tuning.objective import VALUES
 from sb3_sparse.tuning.spaces import with_values
-from sb3_sparse.tuning.study import definition_of, standing_of
+from sb3_sparse.tuning.study import definition_of, status_of
 from sb3_sparse.tuning.yamlfile import as_yaml, merge_entry
 from sb3_sparse.zoo.configs import entry_of
 from sb3_sparse.zoo.environments import is_atari
@@ -27,7 +27,7 @@ def best_of(study: optuna.Study) -> FrozenTrial:
 
     :raises ConfigError: if none was completed
     """
-    best = standing_of(study).best
+    best = status_of(study).best
     if best is None:
         raise ConfigError(f"no trial of {study.study_name!r} was completed yet; let it go on")
     return best
@@ -44,12 +44,12 @@ def best_settings(study: optuna.Study) -> dict[str, Any]:
 
 def describe_best(study: optuna.Study) -> str:
     """Where the values come from, in a line: study, number of trials, score, date."""
-    standing, best = standing_of(study), best_of(study)
+    status, best = status_of(study), best_of(study)
     seeds = definition_of(study).seeds
     mean = f", mean of {seeds} seeds" if seeds > 1 else ""
-    finished = [t.datetime_complete for t in standing.done if t.datetime_complete is not None]
+    finished = [t.datetime_complete for t in status.done if t.datetime_complete is not None]
     return (
-        f"{TUNED}: study {study.study_name}, trial {best.number} of {len(standing.done)} trials, "
+        f"{TUNED}: study {study.study_name}, trial {best.number} of {len(status.done)} trials, "
         f"score {best.values[0]:.6g}{mean}, {max(finished).date()}"
     )
 

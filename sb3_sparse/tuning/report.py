@@ -15,7 +15,7 @@ from sb3_sparse.tuning.definition import Definition
 from sb3_sparse.tuning.objective import VALUES
 from sb3_sparse.tuning.spaces import with_values
 from sb3_sparse.tuning.storage import FOLDER, JOURNAL, open_existing
-from sb3_sparse.tuning.study import DEFINITION, definition_of, find_study, folder_name, standing_of
+from sb3_sparse.tuning.study import DEFINITION, definition_of, find_study, folder_name, status_of
 from sb3_sparse.tuning.urls import shown_url
 from sb3_sparse.zoo.settings import policy_kwargs_of
 
@@ -58,7 +58,7 @@ def write_report(studies: Sequence[optuna.Study], storage: BaseStorage, path: Pa
     :raises ConfigError: if a study has no completed trial
     """
     for study in studies:
-        if not standing_of(study).complete:
+        if not status_of(study).complete:
             raise ConfigError(
                 f"no trial of {study.study_name!r} was completed yet, so there is nothing to report"
             )
@@ -97,18 +97,18 @@ def report_on(
 
 
 def _about(study: optuna.Study) -> list[str]:
-    definition, standing = definition_of(study), standing_of(study)
-    pruned = len(standing.done) - len(standing.complete)
+    definition, status = definition_of(study), status_of(study)
+    pruned = len(status.done) - len(status.complete)
     run = definition.run
     facts = [
-        f"{run.algo.upper()} on {run.env_id}, {_what(definition, standing.best)}",
+        f"{run.algo.upper()} on {run.env_id}, {_what(definition, status.best)}",
         f"{run.settings()['n_timesteps']} steps, {definition.seeds} seed(s) a trial",
         f"sampler {definition.sampler}, pruner {definition.pruner}",
-        f"{len(standing.complete)} completed, {pruned} pruned, {len(standing.failed)} failed, of "
-        f"{standing.planned} planned",
+        f"{len(status.complete)} completed, {pruned} pruned, {len(status.failed)} failed, of "
+        f"{status.planned} planned",
     ]
     parts = [f"<h2>{escape(study.study_name)}</h2>", f"<p>{escape('; '.join(facts))}.</p>"]
-    parts += [f"<h3>The {TOP} best trials</h3>", _top(standing.complete)]
+    parts += [f"<h3>The {TOP} best trials</h3>", _top(status.complete)]
     for title, draw in FIGURES.items():
         parts += [f"<h3>{title}</h3>", _figure(draw, study)]
     return parts
@@ -159,16 +159,16 @@ def _best_by_method(studies: Sequence[optuna.Study], storage: BaseStorage) -> st
             continue
         study = optuna.load_study(storage=storage, study_name=summary.study_name)
         try:
-            definition, standing = definition_of(study), standing_of(study)
+            definition, status = definition_of(study), status_of(study)
         except SparsityError as error:  # e.g. of an environment or method that is not here
             unread += f"<p>Left out: {escape(f'{summary.study_name}: {error}')}</p>\n"
             continue
-        if _task(definition) not in tasks or standing.best is None:
+        if _task(definition) not in tasks or status.best is None:
             continue
-        values = standing.best.user_attrs[VALUES]
-        row = [*_task(definition), _what(definition, standing.best), standing.best.values[0]]
+        values = status.best.user_attrs[VALUES]
+        row = [*_task(definition), _what(definition, status.best), status.best.values[0]]
         shown = ", ".join(f"{name} {value}" for name, value in values.items())
-        row += [shown, f"{len(standing.complete)} of {standing.planned}", definition.seeds]
+        row += [shown, f"{len(status.complete)} of {status.planned}", definition.seeds]
         rows.append([*row, study.study_name])
     heads = ["algorithm", "environment", "steps", "method", "best score", "with", "completed"]
     table = _table([*heads, "seeds a trial", "study"], sorted(rows, key=str))
@@ -194,7 +194,7 @@ def _cell(value: Any) -> str:
 
 def _write_csv(studies: Sequence[optuna.Study], path: Path) -> None:
     """A row a trial: what it was, its values, score, scores of the seeds, seconds."""
-    trials = [(study, trial) for study in studies for trial in standing_of(study).all]
+    trials = [(study, trial) for study in studies for trial in status_of(study).all]
     names = sorted({name for _, trial in trials for name in trial.params})
     heads = ["study", "trial", "state", "score", *names, "scores", "evaluations", "seconds"]
     with path.open("w", newline="") as file:

@@ -18,14 +18,14 @@ from sb3_sparse.tuning.definition import Definition
 from sb3_sparse.tuning.spacefile import space_of
 from sb3_sparse.tuning.spaces import Space
 from sb3_sparse.tuning.storage import FOLDER, HEARTBEAT, JOURNAL, open_storage
-from sb3_sparse.tuning.study import ERROR, Standing, enter_study, folder_name, standing_of
+from sb3_sparse.tuning.study import ERROR, Status, enter_study, folder_name, status_of
 from sb3_sparse.tuning.urls import is_journal, shown_url
 from sb3_sparse.zoo.prepare import prepare
 from sb3_sparse.zoo.run import Run
 
 TRIALS = "trials"
 WORK = "sb3_sparse.tuning.worker:work"
-Watcher = Callable[[Standing], None]
+Watcher = Callable[[Status], None]
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Tuned:
     """What came out.
 
     :param study: Optuna's, to be looked at further
-    :param standing: how far it is
+    :param status: how far it is
     :param folder: with the trials' folders, the workers' logs and ``best.yml``
     :param config: YAML file with the best values; None if no trial was completed
     :param began: whether anything was left to do
@@ -41,7 +41,7 @@ class Tuned:
     """
 
     study: optuna.Study
-    standing: Standing
+    status: Status
     folder: Path
     config: Path | None
     began: bool
@@ -50,7 +50,7 @@ class Tuned:
     @property
     def best(self) -> FrozenTrial | None:
         """The best trial; its ``params`` are the best values, ``values[0]`` the score."""
-        return self.standing.best
+        return self.status.best
 
 
 @quiet_optuna()
@@ -91,7 +91,7 @@ def tune(
     :param launcher: ``"local"``, ``"ray"`` or one of one's own
     :param heartbeat: seconds between two signs of life of a worker; one that gives none for three
         of them is taken for dead
-    :param watch: called with the study's standing, about once in a second
+    :param watch: called with the study's status, about once in a second
     :raises ConfigError: for a value that is not allowed, a storage that cannot be reached, or
         another study of the same name; before anything is trained
     :raises TuningFailed: if every trial failed; with the first one's reason
@@ -107,7 +107,7 @@ def tune(
     errors: dict[str, str] = {}
     with _in_reach(storage):
         study = enter_study(opened, name, definition, number)
-        began = not standing_of(study).finished
+        began = not status_of(study).finished
     if began:
         tasks = _tasks(storage, name, folder, workers, heartbeat)
         with closing(chosen.run(tasks, workers)) as endings:
@@ -116,23 +116,23 @@ def tune(
                     errors[ended.task.name] = ended.error
                 if watch is not None:
                     with suppress(optuna.exceptions.StorageInternalError):  # the workers go on
-                        watch(standing_of(study))
+                        watch(status_of(study))
     with _in_reach(storage):
-        standing = standing_of(study)
-        config = write_best(study, folder / BEST) if standing.best is not None else None
-    _check_outcome(name, standing, folder, errors)
-    return Tuned(study, standing, folder, config, began, errors)
+        status = status_of(study)
+        config = write_best(study, folder / BEST) if status.best is not None else None
+    _check_outcome(name, status, folder, errors)
+    return Tuned(study, status, folder, config, began, errors)
 
 
-def _check_outcome(name: str, standing: Standing, folder: Path, errors: Mapping[str, str]) -> None:
+def _check_outcome(name: str, status: Status, folder: Path, errors: Mapping[str, str]) -> None:
     """Raise if nothing came out, and nobody is at work any more."""
-    if standing.done or standing.running or not (standing.failed or errors):
+    if status.done or status.running or not (status.failed or errors):
         return
     texts = [
         f"trial {trial.number}: {trial.user_attrs.get(ERROR, 'no reason known')}"
-        for trial in sorted(standing.failed, key=lambda trial: trial.number)
+        for trial in sorted(status.failed, key=lambda trial: trial.number)
     ] or [f"{worker}: {error.strip().splitlines()[-1]}" for worker, error in errors.items()]
-    count = len(standing.failed)
+    count = len(status.failed)
     what = f"every trial that was begun ({count})" if count else "every worker"
     raise TuningFailed(
         f"{what} of the study {name!r} failed, first {texts[0]}. The logs of the workers are in "

@@ -152,7 +152,7 @@ def ticket_of(trial: FrozenTrial) -> int | None:
 
 
 @dataclass(frozen=True)
-class Standing:
+class Status:
     """How far a study is.
 
     :param all: every trial that was begun, lost and failed attempts too
@@ -184,13 +184,13 @@ class Standing:
         return len({ticket_of(trial) for trial in self.done}) >= self.planned
 
 
-def standing_of(study: optuna.Study) -> Standing:
+def status_of(study: optuna.Study) -> Status:
     """How far the study is now."""
     trials = study.get_trials(deepcopy=False)
     by_ticket: dict[int | None, FrozenTrial] = {}
     for trial in trials:
         by_ticket[ticket_of(trial)] = trial  # the last attempt counts
-    return Standing(
+    return Status(
         all=tuple(trial for trial in trials if trial.state != TrialState.WAITING),
         planned=study.user_attrs.get(FILLED, 0),
         done=tuple(trial for trial in trials if trial.state in DONE),

@@ -12,7 +12,7 @@ from sb3_sparse.tuning.backend import FrozenTrial, Trial, TrialState, optuna, qu
 from sb3_sparse.tuning.objective import Objective
 from sb3_sparse.tuning.queue import QueueEmpty
 from sb3_sparse.tuning.storage import HEARTBEAT, open_storage, retry_with
-from sb3_sparse.tuning.study import ERROR, definition_of, find_study, standing_of
+from sb3_sparse.tuning.study import ERROR, definition_of, find_study, status_of
 from sb3_sparse.tuning.urls import shown_url
 
 FAILURES = 3
@@ -56,7 +56,7 @@ def work(
             study.optimize(attempt, n_trials=1)
             counts["trained"], in_a_row = counts["trained"] + 1, 0
         except QueueEmpty:
-            if not standing_of(study).running:
+            if not status_of(study).running:
                 return counts
             time.sleep(MOMENT)  # until the others are done, or are found to be lost
         except KeyboardInterrupt:

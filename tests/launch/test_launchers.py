@@ -12,8 +12,8 @@ from contextlib import closing
 import pytest
 
 from sb3_sparse.errors import ConfigError, MissingExtra
-from sb3_sparse.experiments import runner
 from sb3_sparse.launch import Task, launcher_named, launcher_names
+from sb3_sparse.studies import runner
 from sb3_sparse.tuning import search
 
 NAMES = launcher_names()

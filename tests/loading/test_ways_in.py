@@ -15,9 +15,9 @@ from support import make
 
 from sb3_sparse import cli, sparsify
 from sb3_sparse.errors import ConfigError, CorruptStateError, Diverged
-from sb3_sparse.experiments import Study
 from sb3_sparse.loading.statistics import load_statistics, read_statistics
 from sb3_sparse.loading.text import read_text
+from sb3_sparse.studies import Study
 from sb3_sparse.zoo.enjoy import enjoy
 from sb3_sparse.zoo.inspect import inspect_model
 from sb3_sparse.zoo.run import Run

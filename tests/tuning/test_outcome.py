@@ -23,7 +23,7 @@ from sb3_sparse.tuning.best import best_settings, check_target, write_best, writ
 from sb3_sparse.tuning.report import report_on
 from sb3_sparse.tuning.search import define
 from sb3_sparse.tuning.storage import open_storage
-from sb3_sparse.tuning.study import DEFINITION, TICKET, enter_study, standing_of
+from sb3_sparse.tuning.study import DEFINITION, TICKET, enter_study, status_of
 from sb3_sparse.zoo.configs import config_path
 from sb3_sparse.zoo.run import Run
 from sb3_sparse.zoo.train import train
@@ -237,14 +237,14 @@ def test_progress_is_a_line_a_trial_with_the_best_so_far(storage):
     text = io.StringIO()
     progress = TuningProgress(Console(file=text, width=200))
     study = enter_study(storage, "new", define(small_run(), SPACE, 1, None, None, LOGS), 6)
-    progress(standing_of(study))
+    progress(status_of(study))
     for value in (3.0, 1.0):
         study.optimize(lambda trial, value=value: value, n_trials=1)
-        progress(standing_of(study))
+        progress(status_of(study))
     with pytest.raises(ZeroDivisionError):
         study.optimize(lambda trial: 1 / 0, n_trials=1)
-    progress(standing_of(study))
-    progress(standing_of(study))
+    progress(status_of(study))
+    progress(status_of(study))
     progress.close()
     assert [line.rstrip(" ;") for line in text.getvalue().splitlines()] == [
         "1 of 6: trial 0 score 3, best so far 3 (trial 0)",
@@ -257,14 +257,14 @@ def test_the_last_attempt_at_a_planned_trial_counts(storage):
     study = enter_study(storage, "new", define(small_run(), SPACE, 1, None, None, LOGS), 1)
     with pytest.raises(ZeroDivisionError):
         study.optimize(lambda trial: 1 / 0, n_trials=1)
-    assert len(standing_of(study).failed) == 1
+    assert len(status_of(study).failed) == 1
     waiting = optuna.create_trial(state=TrialState.WAITING, system_attrs={TICKET: 0})
     study.add_trial(waiting)
-    assert not standing_of(study).failed
+    assert not status_of(study).failed
     study.optimize(lambda trial: 5.0, n_trials=1)
-    standing = standing_of(study)
-    assert standing.finished
-    assert standing.best.number == 1
+    status = status_of(study)
+    assert status.finished
+    assert status.best.number == 1
 
 
 def test_tune_is_one_call(tmp_path):

@@ -124,7 +124,7 @@ def test_sqlite_trains_a_study_to_its_end(tmp_path):
     url = f"sqlite:///{tmp_path}/studies.db"
     space = choices(weight_decay=[0.0])
     tuned = tune(small_run(), space, storage=url, log_folder=tmp_path, heartbeat=1)
-    assert tuned.standing.finished
+    assert tuned.status.finished
     with sqlite3.connect(tmp_path / "studies.db") as database:
         assert database.execute("select count(*) from trials").fetchone() == (1,)
 

@@ -23,7 +23,7 @@ from sb3_sparse.tuning.queue import QueueEmpty
 from sb3_sparse.tuning.samplers import TICKET, sampler_of
 from sb3_sparse.tuning.search import define
 from sb3_sparse.tuning.storage import open_storage, retry_with
-from sb3_sparse.tuning.study import enter_study, standing_of, ticket_of
+from sb3_sparse.tuning.study import enter_study, status_of, ticket_of
 from sb3_sparse.tuning.worker import TooManyFailures, work
 
 GRID = dict(weight_decay=[0.0, 1e-4], update_interval=[100, 200, 400])
@@ -43,8 +43,8 @@ def test_four_workers_two_of_them_killed_complete_every_cell_once(kind, tmp_path
     storage = request.getfixturevalue("postgres") if kind == "postgres" else None
     killed: dict[int, int] = {}
 
-    def kill_two(standing):
-        for trial in standing.running:
+    def kill_two(status):
+        for trial in status.running:
             worker = trial.user_attrs.get("worker")
             if worker is None or len(killed) == 2:
                 continue
@@ -74,7 +74,7 @@ def test_four_workers_two_of_them_killed_complete_every_cell_once(kind, tmp_path
     assert again == lost
     folders = {path.name for path in (tuned.folder / "trials").iterdir()}
     assert folders == {str(trial.number) for trial in done}
-    assert tuned.standing.finished
+    assert tuned.status.finished
 
     more = tune(small_run(n_timesteps=3000), choices(**GRID), storage=storage, log_folder=tmp_path)
     assert not more.began
@@ -174,10 +174,10 @@ def test_trials_that_fail_are_noted_and_tried_again_by_the_next_command(tmp_path
     journal = tmp_path / "tune" / "journal.log"
     assert work(journal, "study", tmp_path / "trials") == {"trained": 1, "failed": 2}
     study = optuna.load_study(storage=open_storage(journal), study_name="study")
-    standing = standing_of(study)
-    assert [len(standing.done), len(standing.failed)] == [1, 2]
-    assert not standing.finished
-    assert all("No module named 'no'" in trial.user_attrs["error"] for trial in standing.failed)
+    status = status_of(study)
+    assert [len(status.done), len(status.failed)] == [1, 2]
+    assert not status.finished
+    assert all("No module named 'no'" in trial.user_attrs["error"] for trial in status.failed)
     made(tmp_path, space)
     assert states(study) == {"COMPLETE": 1, "FAIL": 2, "WAITING": 2}
 
@@ -388,11 +388,11 @@ def test_a_storage_that_goes_away_is_one_line(tmp_path, monkeypatch):
     def gone(study):
         raise optuna.exceptions.StorageInternalError("me:s3cret@host")
 
-    looks = iter([standing_of])
+    looks = iter([status_of])
     module = sys.modules[tune.__module__]
-    monkeypatch.setattr(module, "standing_of", lambda study: next(looks, gone)(study))
+    monkeypatch.setattr(module, "status_of", lambda study: next(looks, gone)(study))
     with pytest.raises(ConfigError, match="journal.log cannot be reached any more") as caught:
-        made(tmp_path, watch=lambda standing: None)
+        made(tmp_path, watch=lambda status: None)
     assert "s3cret" not in str(caught.value)
 
 

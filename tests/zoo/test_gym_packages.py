@@ -15,10 +15,10 @@ import yaml
 from sb3_sparse.cli.common import values_and_packages
 from sb3_sparse.compress import compress
 from sb3_sparse.errors import ConfigError
-from sb3_sparse.experiments import Study, run_study, standing_of
 from sb3_sparse.export import export
 from sb3_sparse.launch import launcher_named
 from sb3_sparse.report import write_report
+from sb3_sparse.studies import Study, run_study, status_of
 from sb3_sparse.tuning import tune
 from sb3_sparse.tuning.backend import optuna
 from sb3_sparse.tuning.spaces import Space
@@ -178,7 +178,7 @@ def test_a_run_that_rl_zoo_made_is_watched(package, tmp_path):
 def test_workers_of_a_tuning_import_it(package, tmp_path):
     space = Space("s", {"gamma": optuna.distributions.CategoricalDistribution([0.9])})
     tuned = tune(Run(env_id="tiny_envs:Tiny-v0", **SHORT), space, log_folder=tmp_path)
-    assert tuned.standing.finished, tuned.errors
+    assert tuned.status.finished, tuned.errors
     assert tuned.study.study_name == "dqn_Tiny-v0_rigl_0.9_s"
 
 
@@ -199,7 +199,7 @@ def test_studies_name_it_too(named, package, tmp_path):
         *_, last = run_study(study, tmp_path / "store", launcher_named("local"), 1)
         assert (last.done, last.failed) == (1, {})
         forget()
-        folders = [standing_of(cell, tmp_path / "store").folder]
+        folders = [status_of(cell, tmp_path / "store").folder]
         assert write_report(folders, tmp_path / "out", title="T", figures=["curves"]).is_file()
 
 

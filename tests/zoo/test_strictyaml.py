@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from sb3_sparse.errors import ConfigError
-from sb3_sparse.experiments import Study
+from sb3_sparse.studies import Study
 from sb3_sparse.zoo.configs import read_yaml
 from sb3_sparse.zoo.run import Run
 from sb3_sparse.zoo.strictyaml import parse

@@ -11,7 +11,7 @@ from tuning_support import choices
 
 from sb3_sparse.callback import SparsityCallback
 from sb3_sparse.errors import ConfigError
-from sb3_sparse.experiments import Study
+from sb3_sparse.studies import Study
 from sb3_sparse.tuning import Space
 from sb3_sparse.tuning.backend import optuna
 from sb3_sparse.tuning.spaces import check_space

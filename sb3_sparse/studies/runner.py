@@ -8,15 +8,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from sb3_sparse.errors import SparsityError, warn
-from sb3_sparse.experiments.cell import Cell
-from sb3_sparse.experiments.measures import FILES
-from sb3_sparse.experiments.spec import Study
-from sb3_sparse.experiments.standing import DONE, RUNNING, standing_of
 from sb3_sparse.launch.base import Ended, Launcher, Task
+from sb3_sparse.studies.cell import Cell
+from sb3_sparse.studies.measures import FILES
+from sb3_sparse.studies.spec import Study
+from sb3_sparse.studies.status import DONE, RUNNING, status_of
 from sb3_sparse.zoo.archive import Archive, Archived
 from sb3_sparse.zoo.record import DIVERGED
 
-FUNCTION = "sb3_sparse.experiments.work:work_on"
+FUNCTION = "sb3_sparse.studies.worker:work_on"
 
 
 @dataclass
@@ -76,12 +76,12 @@ def run_study(
     :raises CorruptStateError: if a line of the archive is damaged
     """
     kept = _Kept(store, archive)
-    standings = [standing_of(cell, store, kept.lines) for cell in study.cells]
-    over = [one for one in standings if one.status in (DONE, DIVERGED)]
+    statuses = [status_of(cell, store, kept.lines) for cell in study.cells]
+    over = [one for one in statuses if one.status in (DONE, DIVERGED)]
     kept.add(one.cell for one in over if one.archived is None)
     diverged = sum(one.status == DIVERGED for one in over)
     progress = Progress(len(study.cells), done=len(over) - diverged, diverged=diverged)
-    cells = [one.cell for one in standings if one.status not in (DONE, DIVERGED)]
+    cells = [one.cell for one in statuses if one.status not in (DONE, DIVERGED)]
     yield progress
     again: set[str] = set()
     for attempt in (1, 2):

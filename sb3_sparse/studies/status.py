@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from sb3_sparse.errors import SparsityError
-from sb3_sparse.experiments.cell import Cell
 from sb3_sparse.loading.guard import reading
+from sb3_sparse.studies.cell import Cell
 from sb3_sparse.zoo.archive import Archived, Lines
 from sb3_sparse.zoo.checkpoint import is_locked
 from sb3_sparse.zoo.record import CURE, DIVERGED, NAME, WHAT, read_record
@@ -22,7 +22,7 @@ OVER = {True: "finished", False: "counted"}
 
 
 @dataclass(frozen=True)
-class CellStanding:
+class CellStatus:
     """A cell and how far it is.
 
     :param cell: which
@@ -42,7 +42,7 @@ class CellStanding:
     archived: Archived | None = None
 
 
-def standing_of(cell: Cell, store: Path, lines: Lines | None = None) -> CellStanding:
+def status_of(cell: Cell, store: Path, lines: Lines | None = None) -> CellStatus:
     """How far a cell is. A line in the archive goes before what lies in its folder.
 
     :param store: folder of the studies' runs
@@ -52,10 +52,10 @@ def standing_of(cell: Cell, store: Path, lines: Lines | None = None) -> CellStan
     for line in reversed((lines or {}).get(cell.address, ())):
         status, steps = _over(cell, line.record), int(line.record.get("num_timesteps", 0))
         if status is not None:
-            return CellStanding(cell, folder, status, steps, archived=line)
+            return CellStatus(cell, folder, status, steps, archived=line)
     failed, running = cell.errors(store).is_file(), is_locked(folder)
     if not (folder / NAME).is_file():
-        return CellStanding(cell, folder, RUNNING if running else FAILED if failed else WAITING)
+        return CellStatus(cell, folder, RUNNING if running else FAILED if failed else WAITING)
     try:
         record = read_record(folder)
         with reading(folder / NAME, WHAT, CURE):
@@ -63,10 +63,10 @@ def standing_of(cell: Cell, store: Path, lines: Lines | None = None) -> CellStan
             status = _over(cell, record)
     except SparsityError as error:  # one damaged record hides no other cell
         told = str(error).replace(f"{store}{os.sep}", "")  # pages name no path of a machine
-        return CellStanding(cell, folder, FAILED, reason=told)
+        return CellStatus(cell, folder, FAILED, reason=told)
     if running:
-        return CellStanding(cell, folder, RUNNING, steps)
-    return CellStanding(cell, folder, status or (FAILED if failed else STOPPED), steps)
+        return CellStatus(cell, folder, RUNNING, steps)
+    return CellStatus(cell, folder, status or (FAILED if failed else STOPPED), steps)
 
 
 def _over(cell: Cell, record: Mapping[str, Any]) -> str | None:
@@ -77,7 +77,7 @@ def _over(cell: Cell, record: Mapping[str, Any]) -> str | None:
     return DONE if done else None
 
 
-def counts(standings: Sequence[CellStanding]) -> dict[str, int]:
+def counts(statuses: Sequence[CellStatus]) -> dict[str, int]:
     """How many cells there are of each status."""
-    found = Counter(one.status for one in standings)
+    found = Counter(one.status for one in statuses)
     return {status: found[status] for status in STATUSES}

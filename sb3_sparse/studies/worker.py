@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from sb3_sparse.errors import ConfigError, Diverged, RunBusy
-from sb3_sparse.experiments.cell import Cell
-from sb3_sparse.experiments.measures import FILES
-from sb3_sparse.experiments.standing import DONE, OVER, RUNNING, STOPPED, standing_of
+from sb3_sparse.studies.cell import Cell
+from sb3_sparse.studies.measures import FILES
+from sb3_sparse.studies.status import DONE, OVER, RUNNING, STOPPED, status_of
 from sb3_sparse.zoo.checkpoint import LOCK, locked
 from sb3_sparse.zoo.prepare import count
 from sb3_sparse.zoo.progress import TrainingProgress
@@ -30,10 +30,10 @@ def work_on(cell: Cell, store: Path) -> str:
 
     :param store: folder of the studies' runs
     """
-    standing = standing_of(cell, store)
-    if standing.status in (DONE, DIVERGED, RUNNING):
-        return standing.status
-    folder = standing.folder
+    found = status_of(cell, store)
+    if found.status in (DONE, DIVERGED, RUNNING):
+        return found.status
+    folder = found.folder
     try:
         if not cell.trained:
             count(cell.run, folder)
@@ -96,7 +96,7 @@ def _clear(folder: Path) -> None:
 def _measure_noise(folder: Path, run: Run, arguments: Mapping[str, Any]) -> None:
     """Return of the last policy under noise, into ``robustness.csv``, whole or not at all."""
     from sb3_sparse.analysis import noise_robustness
-    from sb3_sparse.experiments.noise import noisy_envs
+    from sb3_sparse.studies.noise import noisy_envs
     from sb3_sparse.zoo.environments import is_atari
 
     model, envs = noisy_envs(folder)

@@ -14,10 +14,10 @@ import torch as th
 from stable_baselines3.common.vec_env import DummyVecEnv
 from study_support import QUICK, RUNS, Here, finish, study
 
-from sb3_sparse.experiments import run_study, standing_of
-from sb3_sparse.experiments.noise import noisy_envs
-from sb3_sparse.experiments.standing import CellStanding, counts
-from sb3_sparse.experiments.work import work_on
+from sb3_sparse.studies import run_study, status_of
+from sb3_sparse.studies.noise import noisy_envs
+from sb3_sparse.studies.status import CellStatus, counts
+from sb3_sparse.studies.worker import work_on
 from sb3_sparse.zoo.checkpoint import locked
 from sb3_sparse.zoo.record import read_record, write_record
 
@@ -43,7 +43,7 @@ def test_runs_lie_in_folders_that_their_content_names(trained):
         folder = store / "runs" / "dqn" / f"CartPole-v1_{cell.address}"
         assert read_record(folder)["status"] == "finished"
         assert (folder / "evaluations.npz").is_file()
-        assert standing_of(cell, store).status == "done"
+        assert status_of(cell, store).status == "done"
 
 
 def test_a_cell_that_is_done_is_never_run_again_nor_by_another_study(trained, tmp_path):
@@ -68,7 +68,7 @@ def test_an_interrupted_cell_goes_on_and_a_lost_folder_begins_anew(trained, tmp_
     (first / "sparsity.json").write_text(json.dumps(record))
     before = weights(first)
     (second / "sparsity.json").unlink()  # a process that was killed at its very start
-    assert [standing_of(c, copy).status for c in made.cells] == ["stopped", "waiting"]
+    assert [status_of(c, copy).status for c in made.cells] == ["stopped", "waiting"]
     assert finish(made, copy).done == 2
     assert all(th.equal(value, before[name]) for name, value in weights(first).items())
     assert read_record(second)["status"] == "finished"
@@ -108,7 +108,7 @@ def test_a_cell_that_fails_twice_is_reported_with_its_traceback_and_the_others_g
     last = finish(made, store, Here({names[0]: 2}))
     assert last.failed == {names[0]: "Traceback: it broke"}
     assert last.done == 1
-    assert standing_of(made.cells[0], store).status == "failed"
+    assert status_of(made.cells[0], store).status == "failed"
     assert made.cells[0].errors(store).read_text().count("Traceback: it broke") == 2
     again = finish(made, store)  # the next start tries it anew
     assert (again.done, again.failed) == (2, {})
@@ -124,9 +124,9 @@ def test_a_cell_that_diverges_is_over_is_no_failure_and_is_not_tried_again(tmp_p
     again = finish(made, store, launcher)
     assert (again.done, again.diverged, again.open) == (1, 1, 0)
     assert len(launcher.called) == 2
-    standings = [standing_of(cell, store) for cell in made.cells]
-    assert sorted(one.status for one in standings) == ["diverged", "done"]
-    assert counts(standings)["diverged"] == 1
+    statuses = [status_of(cell, store) for cell in made.cells]
+    assert sorted(one.status for one in statuses) == ["diverged", "done"]
+    assert counts(statuses)["diverged"] == 1
 
 
 def test_a_cell_that_another_process_trains_is_left_to_it(tmp_path):
@@ -136,7 +136,7 @@ def test_a_cell_that_another_process_trains_is_left_to_it(tmp_path):
     folder.mkdir(parents=True)
     write_record(folder, status="running", num_timesteps=7)
     with locked(folder):
-        assert standing_of(made.cells[0], store).status == "running"
+        assert status_of(made.cells[0], store).status == "running"
         assert work_on(made.cells[0], store) == "running"
     assert read_record(folder)["num_timesteps"] == 7
 
@@ -149,7 +149,7 @@ def test_a_cell_that_another_process_has_just_begun_is_left_to_it(tmp_path):
     folder.mkdir(parents=True)
     (folder / "0.monitor.csv").write_text("of the other process")
     with locked(folder):  # which has written no record yet
-        assert standing_of(made.cells[0], store).status == "running"
+        assert status_of(made.cells[0], store).status == "running"
         assert work_on(made.cells[0], store) == "running"
     assert (folder / "0.monitor.csv").read_text() == "of the other process"
 
@@ -163,9 +163,9 @@ def test_a_cell_that_another_process_takes_or_ends_after_one_has_looked_is_not_r
     (cell, _), (folder, _) = made.cells, [cell.folder(copy) for cell in made.cells]
     before = weights(folder)
     work = importlib.import_module(work_on.__module__)
-    waiting = CellStanding(cell, folder, "waiting")
+    waiting = CellStatus(cell, folder, "waiting")
     looks = iter([True])  # it looked as if there were nothing
-    monkeypatch.setattr(work, "standing_of", lambda *_: waiting)
+    monkeypatch.setattr(work, "status_of", lambda *_: waiting)
     really = work._trained
     monkeypatch.setattr(work, "_trained", lambda f: not next(looks, False) and really(f))
     assert work_on(cell, copy) == "done"
@@ -202,14 +202,14 @@ def test_noise_is_measured_of_the_trained_model_without_training_it_again(traine
     noisy = study(tmp_path, measures={"noise": {"sigmas": [0, 2], "n_episodes": 3}})
     folder = noisy.cells[1].folder(copy)
     before = (folder / "CartPole-v1.zip").stat().st_mtime_ns
-    assert standing_of(noisy.cells[1], copy).status == "stopped"
+    assert status_of(noisy.cells[1], copy).status == "stopped"
     finish(noisy, copy)
     assert (folder / "CartPole-v1.zip").stat().st_mtime_ns == before
     with (folder / "robustness.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [float(row["sigma"]) for row in rows] == [0.0] * 3 + [2.0] * 3
     assert all(1 <= float(row["return"]) <= 500 for row in rows)
-    assert standing_of(noisy.cells[1], copy).status == "done"
+    assert status_of(noisy.cells[1], copy).status == "done"
 
 
 def test_ten_noisy_environments_are_of_one_process(trained):

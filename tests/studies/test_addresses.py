@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from sb3_sparse.experiments import Study
+from sb3_sparse.studies import Study
 
 # As they were when the first archive was written. A change of these makes all that was run be run
 # again: change them only where a run comes out otherwise.

@@ -6,8 +6,8 @@ import pytest
 import yaml
 
 from sb3_sparse.errors import ConfigError
-from sb3_sparse.experiments import Study, study_names
-from sb3_sparse.experiments.blocks import SCALES, planned_runs
+from sb3_sparse.studies import Study, study_names
+from sb3_sparse.studies.blocks import SCALES, planned_runs
 
 MINIMAL = {
     "title": "A title",

@@ -9,7 +9,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from sb3_sparse.experiments.measures import Measures
+from sb3_sparse.studies.measures import Measures
 from sb3_sparse.zoo.run import Run
 
 RUNS = "runs"

@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from sb3_sparse.errors import ConfigError, did_you_mean
-from sb3_sparse.experiments.blocks import (
+from sb3_sparse.sparsity.numeric import is_whole
+from sb3_sparse.studies.blocks import (
     CHOSEN,
     KEYS,
     MEASURES,
@@ -25,9 +26,8 @@ from sb3_sparse.experiments.blocks import (
     path_of,
     planned_arguments,
 )
-from sb3_sparse.experiments.cell import Cell
-from sb3_sparse.experiments.measures import Measures
-from sb3_sparse.sparsity.numeric import is_whole
+from sb3_sparse.studies.cell import Cell
+from sb3_sparse.studies.measures import Measures
 from sb3_sparse.topology import method_named, method_names
 from sb3_sparse.zoo.configs import read_yaml
 from sb3_sparse.zoo.environments import package_names

@@ -13,7 +13,7 @@ from sb3_sparse.errors import ConfigError, did_you_mean
 from sb3_sparse.zoo.configs import read_yaml
 from sb3_sparse.zoo.run import Run
 
-SHIPPED = Path(__file__).parent / "studies"
+SHIPPED = Path(__file__).parent / "shipped"
 SCALES = ("smoke", "small", "medium", "paper")
 """Of shipped studies, which have them all but some medium."""
 KEYS = {"title", "figures", "varies", "common", "runs", "scales", "measures", "trained"}

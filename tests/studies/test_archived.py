@@ -10,7 +10,7 @@ from study_support import RUNS, Here, finish, study
 
 from sb3_sparse.cli.study import report, status
 from sb3_sparse.errors import CorruptStateError, SparsityWarning
-from sb3_sparse.experiments import run_study, standing_of
+from sb3_sparse.studies import run_study, status_of
 from sb3_sparse.zoo.archive import Archive
 from sb3_sparse.zoo.record import read_record
 
@@ -125,17 +125,17 @@ def test_a_cell_of_which_more_is_to_be_measured_is_not_done(trained, tmp_path):
     (cell,) = noisy.cells
     zip_of = cell.folder(tmp_path / "store") / "CartPole-v1.zip"
     before = zip_of.stat().st_mtime_ns
-    assert standing_of(cell, tmp_path / "store", Archive(archive).read()).status == "stopped"
+    assert status_of(cell, tmp_path / "store", Archive(archive).read()).status == "stopped"
     assert finish(noisy, tmp_path / "store", archive=archive).done == 1
     assert zip_of.stat().st_mtime_ns == before
     first, second = Archive(archive).read()[cell.address]
     assert [line.record["measured"] for line in (first, second)] == [NOISE, more]
-    assert standing_of(cell, tmp_path / "none", Archive(archive).read()).archived.record == (
+    assert status_of(cell, tmp_path / "none", Archive(archive).read()).archived.record == (
         second.record
     )
     shutil.rmtree(tmp_path / "store")
     less = study(tmp_path, runs=RUNS[1:], measures={"noise": {"sigmas": [3], "n_episodes": 1}})
-    assert standing_of(cell, tmp_path / "store", Archive(archive).read()).status == "done"
+    assert status_of(cell, tmp_path / "store", Archive(archive).read()).status == "done"
     launcher = Here()
     assert finish(less, tmp_path / "store", launcher, archive).done == 1
     assert launcher.called == [cell.name]
