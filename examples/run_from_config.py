@@ -6,8 +6,8 @@ python examples/run_from_config.py
 import argparse
 from pathlib import Path
 
-from sb3_sparse.zoo.run import Run
-from sb3_sparse.zoo.train import train
+from sb3_sparse.zoo.spec import RunSpec
+from sb3_sparse.zoo.training import train
 
 
 def main() -> None:
@@ -25,8 +25,8 @@ def main() -> None:
         hyperparams={"env_wrapper": noise},
     )
     for run in (
-        Run(method="set", sparsity=0.8, **common),
-        Run(method="dense", match_params=0.8, **common),
+        RunSpec(method="set", sparsity=0.8, **common),
+        RunSpec(method="dense", match_params=0.8, **common),
     ):
         outcome = train(run, Path("logs"))
         print(outcome.model.policy.sparsity_report())

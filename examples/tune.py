@@ -12,7 +12,7 @@ import optuna
 
 from sb3_sparse.tuning import Objective, Space, tune, write_report
 from sb3_sparse.tuning.storage import open_storage
-from sb3_sparse.zoo.run import Run
+from sb3_sparse.zoo.spec import RunSpec
 
 choices = optuna.distributions.CategoricalDistribution
 
@@ -25,7 +25,7 @@ def main() -> None:
     parser.add_argument("--logs", type=Path, default=Path("logs"))
     args = parser.parse_args()
 
-    run = Run("dqn", "CartPole-v1", method="rigl", sparsity=0.9, n_timesteps=args.steps)
+    run = RunSpec("dqn", "CartPole-v1", method="rigl", sparsity=0.9, n_timesteps=args.steps)
     space = Space(
         "example",
         {

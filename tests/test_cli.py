@@ -134,7 +134,7 @@ def test_an_interrupt_says_how_to_go_on_with_this_run(folder, monkeypatch, capsy
             watch.begins(folder, None)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("sb3_sparse.zoo.train.train", interrupted)
+    monkeypatch.setattr("sb3_sparse.zoo.training.train", interrupted)
     monkeypatch.setattr(sys, "argv", ["sb3-sparse", "train"])
     with pytest.raises(SystemExit) as ended:
         main()

@@ -13,9 +13,9 @@ from support import make
 from sb3_sparse import cli
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.export.numpy_policy import Policy
-from sb3_sparse.zoo.run import Run
 from sb3_sparse.zoo.saved import algo_of, find_saved
-from sb3_sparse.zoo.train import train
+from sb3_sparse.zoo.spec import RunSpec
+from sb3_sparse.zoo.training import train
 
 QUICK = dict(n_timesteps=300, eval_freq=100, eval_episodes=2)
 
@@ -36,7 +36,7 @@ def command(monkeypatch, capsys, *arguments):
 @pytest.fixture(scope="module")
 def run_folder(tmp_path_factory):
     settings = dict(normalize=True, n_steps=64, batch_size=32, net_arch=[16, 16])
-    run = Run(
+    run = RunSpec(
         algo="ppo", env_id="Pendulum-v1", method="set", sparsity=0.5, hyperparams=settings, **QUICK
     )
     return train(run, tmp_path_factory.mktemp("logs")).folder

@@ -21,8 +21,8 @@ from sb3_sparse.topology import registry
 from sb3_sparse.tuning import space_of
 from sb3_sparse.tuning.search import define
 from sb3_sparse.tuning.spaces import check_space
-from sb3_sparse.zoo.run import Run
-from sb3_sparse.zoo.train import train
+from sb3_sparse.zoo.spec import RunSpec
+from sb3_sparse.zoo.training import train
 
 ROOT = Path(__file__).parent.parent
 
@@ -178,7 +178,7 @@ def test_the_train_commands_of_the_documents_have_settings(command, monkeypatch)
         runs.append(run)
         raise Enough
 
-    monkeypatch.setattr("sb3_sparse.zoo.train.train", note)
+    monkeypatch.setattr("sb3_sparse.zoo.training.train", note)
     words = shlex.split(command, comments=True)[1:]
     with pytest.raises(Enough):
         cli.app(words, standalone_mode=False)
@@ -215,7 +215,7 @@ def test_the_spaces_of_the_documents_are_spaces(tmp_path):
         code = re.findall(rf"```{kind}\n(.*?)```", text, re.DOTALL)[0]
         path = tmp_path / f"mine.{suffix}"
         path.write_text(code)
-        check_space(space_of(str(path), Run()), Run())
+        check_space(space_of(str(path), RunSpec()), RunSpec())
 
 
 def test_the_script_of_the_tuning_document_runs(tmp_path, monkeypatch, capsys):
@@ -234,7 +234,7 @@ def test_the_config_of_the_documents_trains(tmp_path):
     (config,) = re.findall(r"```yaml\n(.*?)```", (ROOT / "docs/configs.md").read_text(), re.DOTALL)
     path = tmp_path / "mine.yml"
     path.write_text(config)
-    outcome = train(Run(conf_file=str(path), n_timesteps=200), tmp_path)
+    outcome = train(RunSpec(conf_file=str(path), n_timesteps=200), tmp_path)
     assert outcome.finished
     assert outcome.model.learning_rate(1.0) == 1e-3
     assert abs(outcome.model.policy.sparse.sparsity - 0.95) < 0.001

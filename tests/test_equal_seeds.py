@@ -16,12 +16,12 @@ from support import make
 
 from sb3_sparse import SparsityCallback
 from sb3_sparse.loading.zips import read_model
-from sb3_sparse.zoo.run import Run
-from sb3_sparse.zoo.train import train
+from sb3_sparse.zoo.spec import RunSpec
+from sb3_sparse.zoo.training import train
 
 SMALL, LARGE = 24, 200
 CASES = [(name, width) for name in ("DQN", "SAC", "PPO") for width in (SMALL, LARGE)]
-RUN = Run(
+RUN = RunSpec(
     algo="sac",
     env_id="Pendulum-v1",
     n_timesteps=120,

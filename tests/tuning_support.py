@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from sb3_sparse.tuning import Space
 from sb3_sparse.tuning.backend import optuna
-from sb3_sparse.zoo.run import Run
+from sb3_sparse.zoo.spec import RunSpec
 
 
-def small_run(**changes) -> Run:
+def small_run(**changes) -> RunSpec:
     """A run of a second."""
     settings = dict(
         n_timesteps=600,
@@ -15,7 +15,7 @@ def small_run(**changes) -> Run:
         eval_episodes=2,
         hyperparams={"net_arch": [16], "learning_starts": 50, "buffer_size": 1000},
     )
-    return Run(**{**settings, **changes})
+    return RunSpec(**{**settings, **changes})
 
 
 def choices(**lists) -> Space:

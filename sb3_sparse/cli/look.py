@@ -31,8 +31,8 @@ def enjoy(
     gym_packages: GymPackages = None,
 ) -> None:
     """Evaluate a saved policy, and record a video of it."""
-    from sb3_sparse.zoo.enjoy import enjoy as score_run
     from sb3_sparse.zoo.progress import EpisodesProgress
+    from sb3_sparse.zoo.scoring import enjoy as score_run
 
     progress = EpisodesProgress(console)
     what = "Filming" if video else "Playing"
@@ -64,6 +64,6 @@ def inspect(
     model: Annotated[Path, typer.Argument(help="A run's folder, or a model saved by SB3 (.zip).")],
 ) -> None:
     """Print the layers of a saved sparse model, and how each of them computes."""
-    from sb3_sparse.zoo.inspect import inspect_model
+    from sb3_sparse.zoo.inspection import inspect_model
 
     console.print(str(inspect_model(model)), soft_wrap=True)

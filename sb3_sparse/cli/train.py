@@ -29,8 +29,8 @@ from sb3_sparse.cli.common import (
     values_and_packages,
 )
 from sb3_sparse.errors import ConfigError, command
-from sb3_sparse.zoo.run import Run
 from sb3_sparse.zoo.settings import method_of, parse_overrides
+from sb3_sparse.zoo.spec import RunSpec
 
 SHORT = 1e-3  # what a sparsity may miss by rounding
 
@@ -71,7 +71,7 @@ def train(
         _refuse_other_options(context)
     else:
         values, packages = values_and_packages(context.args, hyperparams, gym_packages)
-        run = Run(
+        run = RunSpec(
             algo=algo.lower(),
             env_id=env,
             method=method,
@@ -89,7 +89,7 @@ def train(
             gym_packages=tuple(packages),
         )
         run.config_entry()  # a mistyped name shall not wait for torch
-    from sb3_sparse.zoo import train as engine
+    from sb3_sparse.zoo import training as engine
     from sb3_sparse.zoo.progress import TrainingProgress
 
     progress = TrainingProgress(console)
@@ -134,7 +134,7 @@ def train(
         console.print(command(*words), soft_wrap=True)
 
 
-def _headline(run: Run) -> str:
+def _headline(run: RunSpec) -> str:
     settings = run.settings()
     kwargs, method = settings["policy_kwargs"], method_of(settings)
     if run.match_params is not None:

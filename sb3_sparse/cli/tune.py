@@ -34,8 +34,8 @@ from sb3_sparse.cli.common import (
 from sb3_sparse.cli.tuneprogress import TuningProgress, values_in_words
 from sb3_sparse.launch import launcher_named
 from sb3_sparse.tuning.choices import check_names
-from sb3_sparse.zoo.run import Run
 from sb3_sparse.zoo.settings import parse_overrides
+from sb3_sparse.zoo.spec import RunSpec
 
 if TYPE_CHECKING:
     from sb3_sparse.tuning import Tuned
@@ -114,7 +114,7 @@ def search(
     values, packages = values_and_packages(context.args, hyperparams, gym_packages)
     check_names(space, sampler, pruner)
     chosen = launcher_named(launcher, address)
-    run = Run(
+    run = RunSpec(
         algo=algo.lower(),
         env_id=env,
         method=method,
@@ -167,7 +167,7 @@ def search(
         raise typer.Exit(1)
 
 
-def _print_outcome(run: Run, tuned: Tuned, storage: str | None, log_folder: Path) -> None:
+def _print_outcome(run: RunSpec, tuned: Tuned, storage: str | None, log_folder: Path) -> None:
     from sb3_sparse.tuning.urls import shown_url
 
     status, name = tuned.status, tuned.study.study_name

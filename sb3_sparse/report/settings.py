@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from sb3_sparse.policies.config import SparsityConfig
-from sb3_sparse.zoo.run import algorithms
+from sb3_sparse.zoo.spec import algorithms
 
 CALLBACK = "SparsityCallback"
 CLASSIC = ("CartPole", "Acrobot", "MountainCar", "MountainCarContinuous", "Pendulum")

@@ -11,13 +11,13 @@ from typing import Any
 
 from sb3_sparse.errors import ConfigError, did_you_mean
 from sb3_sparse.zoo.configs import read_yaml
-from sb3_sparse.zoo.run import Run
+from sb3_sparse.zoo.spec import RunSpec
 
 SHIPPED = Path(__file__).parent / "shipped"
 SCALES = ("smoke", "small", "medium", "paper")
 """Of shipped studies, which have them all but some medium."""
 KEYS = {"title", "figures", "varies", "common", "runs", "scales", "measures", "trained"}
-RUN_KEYS = {one.name for one in fields(Run)} - {"seed", "device", "entry"}
+RUN_KEYS = {one.name for one in fields(RunSpec)} - {"seed", "device", "entry"}
 CHOSEN = ("sparsity", "match_params", "method", "distribution", "algo")
 """What a scale chooses among a block's own values."""
 VARY, SEEDS, MEASURES, SCHEDULE = "vary", "seeds", "measures", "schedule"

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from sb3_sparse.studies.measures import Measures
-from sb3_sparse.zoo.run import Run
+from sb3_sparse.zoo.spec import RunSpec
 
 RUNS = "runs"
 DIGITS = 12
@@ -25,7 +25,7 @@ class Cell:
     :param trained: False: its networks are only built and counted
     """
 
-    run: Run
+    run: RunSpec
     measures: Measures = field(default_factory=Measures)
     trained: bool = True
 

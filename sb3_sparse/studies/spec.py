@@ -31,8 +31,8 @@ from sb3_sparse.studies.measures import Measures
 from sb3_sparse.topology import method_named, method_names
 from sb3_sparse.zoo.configs import read_yaml
 from sb3_sparse.zoo.environments import package_names
-from sb3_sparse.zoo.run import Run
 from sb3_sparse.zoo.settings import Names, find_callback
+from sb3_sparse.zoo.spec import RunSpec
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,7 @@ def _cells(
     ]
     for seed in range(seeds):
         for arguments in runs:
-            cell = Cell(Run(**arguments, seed=seed), measures, trained)
+            cell = Cell(RunSpec(**arguments, seed=seed), measures, trained)
             measures.check(cell.run.algorithm)
             yield cell
 
@@ -187,7 +187,7 @@ def _check_choices(blocks: Sequence[Mapping[str, Any]], scale: Mapping[str, Any]
 
 def _with_schedule(arguments: dict[str, Any], schedule: Mapping[str, Any]) -> dict[str, Any]:
     """With what of a scale's ``schedule`` the method takes: nothing where masks stand still."""
-    run = Run(**arguments)
+    run = RunSpec(**arguments)
     callback = find_callback(run.settings()) if schedule else None
     if callback is None:
         return arguments

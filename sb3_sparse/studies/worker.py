@@ -19,8 +19,8 @@ from sb3_sparse.zoo.checkpoint import LOCK, locked
 from sb3_sparse.zoo.prepare import count
 from sb3_sparse.zoo.progress import TrainingProgress
 from sb3_sparse.zoo.record import DIVERGED, NAME, read_record, write_record
-from sb3_sparse.zoo.run import Run
-from sb3_sparse.zoo.train import resume, train
+from sb3_sparse.zoo.spec import RunSpec
+from sb3_sparse.zoo.training import resume, train
 
 
 def work_on(cell: Cell, store: Path) -> str:
@@ -54,7 +54,7 @@ def _measure(cell: Cell, folder: Path) -> None:
     """Measure what is still wanted of the trained model."""
     record = read_record(folder)
     for name, arguments in cell.measures.missing(record).items():
-        _measure_noise(folder, Run(**record["run"]), arguments)
+        _measure_noise(folder, RunSpec(**record["run"]), arguments)
         measured = {**read_record(folder).get("measured", {}), name: dict(arguments)}
         write_record(folder, measured=measured)
 
@@ -93,7 +93,7 @@ def _clear(folder: Path) -> None:
                 path.unlink()
 
 
-def _measure_noise(folder: Path, run: Run, arguments: Mapping[str, Any]) -> None:
+def _measure_noise(folder: Path, run: RunSpec, arguments: Mapping[str, Any]) -> None:
     """Return of the last policy under noise, into ``robustness.csv``, whole or not at all."""
     from sb3_sparse.analysis import noise_robustness
     from sb3_sparse.studies.noise import noisy_envs

@@ -15,8 +15,8 @@ from sb3_sparse.tuning.study import definition_of, status_of
 from sb3_sparse.tuning.yamlfile import as_yaml, merge_entry
 from sb3_sparse.zoo.configs import entry_of
 from sb3_sparse.zoo.environments import is_atari
-from sb3_sparse.zoo.run import Run
 from sb3_sparse.zoo.settings import method_of
+from sb3_sparse.zoo.spec import RunSpec
 
 BEST = "best.yml"
 TUNED = "Tuned by sb3-sparse"
@@ -68,7 +68,7 @@ def write_best(study: optuna.Study, path: Path) -> Path:
     return path
 
 
-def check_target(run: Run, path: Path) -> None:
+def check_target(run: RunSpec, path: Path) -> None:
     """Refuse a config that the tuned settings of a run have no place in.
 
     :raises ConfigError: if there is no such file, it is for another method, or its entry is not

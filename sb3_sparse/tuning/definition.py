@@ -12,8 +12,8 @@ from sb3_sparse.tuning.backend import optuna
 from sb3_sparse.tuning.objective import check_seeds, planned_evaluations
 from sb3_sparse.tuning.samplers import pruner_of, sampler_of
 from sb3_sparse.tuning.spaces import Space, check_space, one_of_each, with_values
-from sb3_sparse.zoo.run import Run
 from sb3_sparse.zoo.settings import method_of, policy_kwargs_of
+from sb3_sparse.zoo.spec import RunSpec
 
 DEFAULT_TRIALS = 100
 NOT_COMPARED = ("run.entry",)  # what the config's file had: that is compared as settings
@@ -31,7 +31,7 @@ class Definition:
     :raises ConfigError: if these do not go together
     """
 
-    run: Run
+    run: RunSpec
     space: Space
     seeds: int
     sampler: str
@@ -108,7 +108,7 @@ class Definition:
     def from_dict(values: Mapping[str, Any]) -> Definition:
         """What :meth:`as_dict` described."""
         space = Space.from_dict(values["space"])
-        run = Run(**values["run"])
+        run = RunSpec(**values["run"])
         how = (values[name] for name in ("seeds", "sampler", "pruner"))
         return Definition(run, space, *how)
 

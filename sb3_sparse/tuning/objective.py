@@ -19,8 +19,8 @@ from sb3_sparse.zoo.checkpoint import clear_checkpoints
 from sb3_sparse.zoo.evaluation import Evaluation
 from sb3_sparse.zoo.record import write_record
 from sb3_sparse.zoo.results import score_of
-from sb3_sparse.zoo.run import Run
-from sb3_sparse.zoo.train import train
+from sb3_sparse.zoo.spec import RunSpec
+from sb3_sparse.zoo.training import train
 
 MAX_SEEDS = 1000
 VALUES = "hyperparams"
@@ -46,7 +46,7 @@ class Objective:
     """
 
     def __init__(
-        self, run: Run, space: Space, seeds: int = 1, folder: Path = Path("logs/tune/trials")
+        self, run: RunSpec, space: Space, seeds: int = 1, folder: Path = Path("logs/tune/trials")
     ) -> None:
         check_seeds(seeds)
         self.run, self.space, self.seeds, self.folder = run, space, seeds, folder
@@ -95,7 +95,7 @@ def check_seeds(seeds: int) -> None:
         raise ConfigError(f"seeds must lie in [1, {MAX_SEEDS}], got {seeds}")
 
 
-def planned_evaluations(run: Run) -> int:
+def planned_evaluations(run: RunSpec) -> int:
     """How many evaluations a run has.
 
     :raises ConfigError: if there is none

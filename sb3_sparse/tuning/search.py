@@ -21,7 +21,7 @@ from sb3_sparse.tuning.storage import FOLDER, HEARTBEAT, JOURNAL, open_storage
 from sb3_sparse.tuning.study import ERROR, Status, enter_study, folder_name, status_of
 from sb3_sparse.tuning.urls import is_journal, shown_url
 from sb3_sparse.zoo.prepare import prepare
-from sb3_sparse.zoo.run import Run
+from sb3_sparse.zoo.spec import RunSpec
 
 TRIALS = "trials"
 WORK = "sb3_sparse.tuning.worker:work"
@@ -55,7 +55,7 @@ class Tuned:
 
 @quiet_optuna()
 def tune(
-    run: Run,
+    run: RunSpec,
     space: str | Space = "paper",
     *,
     trials: int | None = None,
@@ -162,7 +162,7 @@ def _checked(name: str) -> str:
 
 
 def define(
-    run: Run,
+    run: RunSpec,
     space: str | Space,
     seeds: int,
     sampler: str | None,

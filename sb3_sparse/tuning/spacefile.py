@@ -22,12 +22,12 @@ from sb3_sparse.tuning.spaces import (
 from sb3_sparse.zoo.configs import read_yaml
 from sb3_sparse.zoo.match import untrained_policy
 from sb3_sparse.zoo.prepare import prepare
-from sb3_sparse.zoo.run import Run
 from sb3_sparse.zoo.settings import method_of
+from sb3_sparse.zoo.spec import RunSpec
 
 
 @quiet_optuna()
-def space_of(what: str, run: Run) -> Space:
+def space_of(what: str, run: RunSpec) -> Space:
     """A shipped space for a run, or the user's own from a file.
 
     A YAML file maps names to lists of choices or to ``{low: .., high: .., log: true, step: ..}``; a
@@ -55,7 +55,7 @@ def space_of(what: str, run: Run) -> Space:
     return Space(path.stem, code=code)
 
 
-def _wide(run: Run, method: str) -> Space:
+def _wide(run: RunSpec, method: str) -> Space:
     prepared = prepare(run, Path("logs"))
     policy = untrained_policy(
         run.algorithm, prepared.observation_space, prepared.action_space, prepared.settings

@@ -11,8 +11,8 @@ from typing import Any
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.topology import method_named
 from sb3_sparse.tuning.backend import BaseDistribution, Trial, optuna, quiet_optuna
-from sb3_sparse.zoo.run import DENSE, Run
 from sb3_sparse.zoo.settings import method_of
+from sb3_sparse.zoo.spec import DENSE, RunSpec
 
 CategoricalDistribution = optuna.distributions.CategoricalDistribution
 FloatDistribution = optuna.distributions.FloatDistribution
@@ -161,7 +161,7 @@ def run_code(code: str, name: str) -> Any:
     return found
 
 
-def with_values(run: Run, values: Mapping[str, Any]) -> Run:
+def with_values(run: RunSpec, values: Mapping[str, Any]) -> RunSpec:
     """The run with sampled values for its hyperparameters."""
     return replace(run, hyperparams={**run.hyperparams, **values})
 
@@ -182,7 +182,7 @@ def one_of_each(space: Space) -> dict[str, Any]:
     return {name: value for values in samples_of(space) for name, value in values.items()}
 
 
-def check_space(space: Space, run: Run) -> None:
+def check_space(space: Space, run: RunSpec) -> None:
     """Refuse a space that the run has no place for, before anything is trained.
 
     Tries samples, and every choice and both ends of every range in one.
@@ -199,7 +199,7 @@ def check_space(space: Space, run: Run) -> None:
             with_values(run, {**samples[0], name: value}).settings()
 
 
-def _check_names(space: Space, run: Run, names: Set[str]) -> None:
+def _check_names(space: Space, run: RunSpec, names: Set[str]) -> None:
     if "n_timesteps" in names:
         raise ConfigError(
             f"the search space {space.name!r} varies n_timesteps, but trials are compared at equal "

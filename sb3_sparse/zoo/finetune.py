@@ -18,8 +18,8 @@ from sb3_sparse.loading.zooyaml import NotBuilt
 from sb3_sparse.policies.named import import_path
 from sb3_sparse.sparsity.numeric import is_whole
 from sb3_sparse.zoo.environments import import_packages, is_atari, known_environment
-from sb3_sparse.zoo.experiment import quiet
 from sb3_sparse.zoo.folder import CONFIG, RESTORE, arguments_of, params_of
+from sb3_sparse.zoo.manager import quiet
 from sb3_sparse.zoo.mujoco import mujoco_warns_once
 from sb3_sparse.zoo.prepare import explained
 from sb3_sparse.zoo.saved import Saved

@@ -14,8 +14,8 @@ from sb3_sparse.loading.zips import read_model
 from sb3_sparse.zoo.arguments import is_whole
 from sb3_sparse.zoo.folder import VECNORMALIZE, params_of
 from sb3_sparse.zoo.record import CURE, NAME, WHAT
-from sb3_sparse.zoo.run import Run
 from sb3_sparse.zoo.saved import Saved, check_attributes
+from sb3_sparse.zoo.spec import RunSpec
 from sb3_sparse.zoo.validation import check_settings
 
 
@@ -29,7 +29,7 @@ class Plan:
     :param tensorboard_log: where TensorBoard's files go; empty: none
     """
 
-    run: Run
+    run: RunSpec
     settings: dict[str, Any]
     evaluation: dict[str, int]
     tensorboard_log: str
@@ -54,14 +54,14 @@ def planned(folder: Path, record: Mapping[str, Any]) -> Plan:
                 raise CorruptStateError(
                     f"{path} is damaged: {name} is {evaluation[name]!r}; {CURE}"
                 )
-        run = Run(**record["run"])
+        run = RunSpec(**record["run"])
         check_settings(settings, run.algorithm)
         if "n_timesteps" not in settings:
             raise CorruptStateError(f"{path} is damaged: its settings lack n_timesteps; {CURE}")
         return Plan(run, settings, evaluation, str(record["tensorboard_log"]))
 
 
-def check_start(start: Path, run: Run) -> None:
+def check_start(start: Path, run: RunSpec) -> None:
     """Refuse a model or statistics that training cannot go on from.
 
     :param start: folder of a checkpoint, or of the run

@@ -14,11 +14,11 @@ from gymnasium import spaces
 
 from sb3_sparse.errors import ConfigError, MissingExtra, SparsityError, Unwritable
 from sb3_sparse.zoo.disk import refusal
-from sb3_sparse.zoo.experiment import spaces_of
+from sb3_sparse.zoo.manager import spaces_of
 from sb3_sparse.zoo.match import Match, match_parameters, untrained_policy
 from sb3_sparse.zoo.record import sparsity_of, versions, write_record
-from sb3_sparse.zoo.run import Run
 from sb3_sparse.zoo.settings import method_of
+from sb3_sparse.zoo.spec import RunSpec
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Prepared:
     action_space: spaces.Space[Any]
     match: Match | None
 
-    def record(self, run: Run) -> dict[str, Any]:
+    def record(self, run: RunSpec) -> dict[str, Any]:
         """What ``sparsity.json`` says of the run from its start."""
         match = {} if self.match is None else {"match": asdict(self.match)}
         return {
@@ -51,7 +51,7 @@ class Prepared:
         }
 
 
-def prepare(run: Run, log_folder: Path) -> Prepared:
+def prepare(run: RunSpec, log_folder: Path) -> Prepared:
     """Check a run and make its environment once, without training or writing anything.
 
     :raises ConfigError: if something is wrong with device, settings or environment, or the
@@ -89,12 +89,12 @@ def check_device(device: str) -> None:
         ) from error
 
 
-def count(run: Run, folder: Path) -> None:
+def count(run: RunSpec, folder: Path) -> None:
     """Record what a run's networks would hold and cost, in a folder of its own; no training.
 
     Networks that would be pruned are counted as they end, not as they begin.
 
-    :param folder: as of :func:`sb3_sparse.zoo.train.train`
+    :param folder: as of :func:`sb3_sparse.zoo.training.train`
     :raises ConfigError: as :func:`prepare`
     """
     prepared = prepare(run, folder.parent.parent)
@@ -109,7 +109,7 @@ def count(run: Run, folder: Path) -> None:
     write_record(folder, status="counted", **prepared.record(run), **sparsity_of(policy))
 
 
-def doubt(run: Run) -> str:
+def doubt(run: RunSpec) -> str:
     """What to say when an environment or algorithm fails before training."""
     return f"the settings of {run.env_id} in {run.config}, with what you changed, do not work"
 
@@ -135,7 +135,7 @@ def explained(failure: str, env_id: str) -> Iterator[None]:
         raise ConfigError(f"{failure}: {type(error).__name__}: {error}") from error
 
 
-def check_action_space(run: Run, space: spaces.Space[Any]) -> None:
+def check_action_space(run: RunSpec, space: spaces.Space[Any]) -> None:
     """Refuse an environment whose actions the algorithm cannot choose.
 
     :raises ConfigError: if so

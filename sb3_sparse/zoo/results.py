@@ -18,7 +18,7 @@ from sb3_sparse.loading.guard import reading
 from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.policies.mixin import SparsePolicyMixin
 from sb3_sparse.zoo.divergence import check_return
-from sb3_sparse.zoo.run import Run
+from sb3_sparse.zoo.spec import RunSpec
 from sb3_sparse.zoo.watch import Watch, counting
 
 SCORED_SHARE = 0.1
@@ -90,7 +90,7 @@ def score_of(mean_returns: Sequence[float]) -> float:
 
 
 def final_results(
-    run: Run,
+    run: RunSpec,
     model: BaseAlgorithm,
     path: Path,
     envs: VecEnv,

@@ -18,7 +18,6 @@ from sb3_sparse.loading.zips import check_state, look_into, read_model
 from sb3_sparse.policies.saving import differ
 from sb3_sparse.zoo.arguments import Kind, is_whole, kind_of
 from sb3_sparse.zoo.environments import package_names
-from sb3_sparse.zoo.experiment import load_for_prediction, loadable_algorithms, quiet
 from sb3_sparse.zoo.folder import (
     ARGUMENTS,
     CONFIG,
@@ -31,7 +30,8 @@ from sb3_sparse.zoo.folder import (
     params_of,
     zip_path,
 )
-from sb3_sparse.zoo.run import algorithms
+from sb3_sparse.zoo.manager import load_for_prediction, loadable_algorithms, quiet
+from sb3_sparse.zoo.spec import algorithms
 
 BY_POLICY = {
     "DQNPolicy": "dqn",

@@ -14,8 +14,8 @@ import yaml
 
 from sb3_sparse import cli
 from sb3_sparse.report.data import read_runs
-from sb3_sparse.zoo.run import Run
-from sb3_sparse.zoo.train import train
+from sb3_sparse.zoo.spec import RunSpec
+from sb3_sparse.zoo.training import train
 
 ENV = "Pendulum-v1"
 COMMANDS = {
@@ -37,7 +37,7 @@ READS = {
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     settings = dict(normalize=True, n_steps=64, batch_size=32, net_arch=[8])
-    run = Run(
+    run = RunSpec(
         algo="ppo",
         env_id=ENV,
         method="static",

@@ -22,7 +22,7 @@ from sb3_sparse import SparseSACPolicy, cli
 from sb3_sparse.errors import ConfigError, CorruptStateError
 from sb3_sparse.loading.zooyaml import NotBuilt, read_zoo_yaml
 from sb3_sparse.zoo.finetune import check_wrappers
-from sb3_sparse.zoo.inspect import inspect_model
+from sb3_sparse.zoo.inspection import inspect_model
 from sb3_sparse.zoo.saved import algo_of
 
 

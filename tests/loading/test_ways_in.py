@@ -18,11 +18,11 @@ from sb3_sparse.errors import ConfigError, CorruptStateError, Diverged
 from sb3_sparse.loading.statistics import load_statistics, read_statistics
 from sb3_sparse.loading.text import read_text
 from sb3_sparse.studies import Study
-from sb3_sparse.zoo.enjoy import enjoy
-from sb3_sparse.zoo.inspect import inspect_model
-from sb3_sparse.zoo.run import Run
+from sb3_sparse.zoo.inspection import inspect_model
 from sb3_sparse.zoo.saved import find_saved
-from sb3_sparse.zoo.train import train
+from sb3_sparse.zoo.scoring import enjoy
+from sb3_sparse.zoo.spec import RunSpec
+from sb3_sparse.zoo.training import train
 
 ENV = "Pendulum-v1"
 
@@ -31,7 +31,7 @@ ENV = "Pendulum-v1"
 def whole(tmp_path_factory):
     settings = dict(normalize=True, n_steps=64, batch_size=32, net_arch=[8])
     quick = dict(n_timesteps=128, eval_freq=64, eval_episodes=1)
-    run = Run(algo="ppo", env_id=ENV, method="static", sparsity=0.5, hyperparams=settings, **quick)
+    run = RunSpec("ppo", ENV, "static", sparsity=0.5, hyperparams=settings, **quick)
     return train(run, tmp_path_factory.mktemp("logs")).folder
 
 

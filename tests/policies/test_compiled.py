@@ -21,7 +21,7 @@ from sb3_sparse.compress.state import fingerprint
 from sb3_sparse.errors import CorruptStateError
 from sb3_sparse.export import FORMATS, export
 from sb3_sparse.policies.compiled import plain_names, unwrapped
-from sb3_sparse.zoo.inspect import inspect_model
+from sb3_sparse.zoo.inspection import inspect_model
 from sb3_sparse.zoo.saved import algo_of
 
 pytestmark = pytest.mark.filterwarnings("error:Dynamo")

@@ -25,8 +25,8 @@ from sb3_sparse.tuning.search import define
 from sb3_sparse.tuning.storage import open_storage
 from sb3_sparse.tuning.study import DEFINITION, TICKET, enter_study, status_of
 from sb3_sparse.zoo.configs import config_path
-from sb3_sparse.zoo.run import Run
-from sb3_sparse.zoo.train import train
+from sb3_sparse.zoo.spec import RunSpec
+from sb3_sparse.zoo.training import train
 
 LOGS = Path("logs")
 SPACE = choices(weight_decay=[0.0, 1e-6, 1e-4], update_interval=[100, 200])
@@ -80,7 +80,7 @@ def test_the_best_values_are_a_config_that_trains_as_it_is(study, tmp_path):
     assert entry["policy_kwargs"]["weight_decay"] == 1e-6
     assert "compute" not in entry["policy_kwargs"]  # a choice of tuning's
     assert entry["callback"][0]["sb3_sparse.SparsityCallback"]["update_interval"] == 100
-    outcome = train(Run(conf_file=str(path), eval_freq=300, eval_episodes=1), tmp_path)
+    outcome = train(RunSpec(conf_file=str(path), eval_freq=300, eval_episodes=1), tmp_path)
     assert outcome.finished
     assert outcome.model.policy.optimizer.param_groups[0]["lr"] == 1e-3
     assert outcome.model.num_timesteps == 600

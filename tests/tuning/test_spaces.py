@@ -11,7 +11,7 @@ from sb3_sparse.tuning import Space, paper_space, space_of
 from sb3_sparse.tuning.backend import optuna
 from sb3_sparse.tuning.definition import Definition
 from sb3_sparse.tuning.spaces import check_space
-from sb3_sparse.zoo.run import Run
+from sb3_sparse.zoo.spec import RunSpec
 
 DECAY = [0.0, 1e-6, 1e-4, 1e-3]
 INTERVAL = [100, 250, 500, 1000, 5000]
@@ -119,7 +119,7 @@ def test_a_function_may_search_what_depends_on_other_values(tmp_path):
     space = Space.from_dict(space.as_dict())
     values = space.sample(optuna.trial.FixedTrial({"width": 8, "lr": 5e-4}))
     assert values == {"net_arch": [8, 8], "learning_rate": 5e-4}
-    check_space(space, Run(n_timesteps=3000))
+    check_space(space, RunSpec(n_timesteps=3000))
 
 
 @pytest.mark.parametrize(
@@ -151,7 +151,7 @@ def test_a_function_may_search_what_depends_on_other_values(tmp_path):
     ],
 )
 def test_a_space_that_the_run_has_no_place_for_is_refused(run, space, message):
-    run = Run(**{"n_timesteps": 3000, **run})
+    run = RunSpec(**{"n_timesteps": 3000, **run})
     with pytest.raises(ConfigError, match=message):
         check_space(choices(**space), run)
 

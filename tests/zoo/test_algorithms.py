@@ -13,12 +13,12 @@ from support import ALGORITHMS, make
 
 import sb3_sparse
 from sb3_sparse.algorithms.table import HOMES, trainer_of
-from sb3_sparse.zoo.run import Run, algorithms
 from sb3_sparse.zoo.saved import find_saved
-from sb3_sparse.zoo.train import resume, train
+from sb3_sparse.zoo.spec import RunSpec, algorithms
+from sb3_sparse.zoo.training import resume, train
 
 SMALL = {"net_arch": [16, 16], "batch_size": 16, "learning_starts": 50, "update_interval": 20}
-RUN = Run(n_timesteps=300, hyperparams=SMALL, eval_freq=100, eval_episodes=1)
+RUN = RunSpec(n_timesteps=300, hyperparams=SMALL, eval_freq=100, eval_episodes=1)
 
 
 @pytest.mark.parametrize("name", sorted(ALGORITHMS))
@@ -27,7 +27,7 @@ def test_the_class_of_an_algorithm_is_ours_where_there_is_one(name):
     assert found is (getattr(sb3_sparse, name) if name in HOMES else ALGORITHMS[name])
     assert found.__name__ == name
     assert issubclass(found, ALGORITHMS[name])
-    assert Run(name.lower(), "CartPole-v1").algorithm is found
+    assert RunSpec(name.lower(), "CartPole-v1").algorithm is found
     assert ALGOS[name.lower()] is ALGORITHMS[name]  # rl-zoo's own commands go on with those
 
 

@@ -15,10 +15,10 @@ from sb3_sparse.errors import ConfigError, RunBusy, SparsityError
 from sb3_sparse.zoo import checkpoint
 from sb3_sparse.zoo.checkpoint import is_locked, last_checkpoint, locked
 from sb3_sparse.zoo.record import read_record
-from sb3_sparse.zoo.run import Run
-from sb3_sparse.zoo.train import resume, train
+from sb3_sparse.zoo.spec import RunSpec
+from sb3_sparse.zoo.training import resume, train
 
-RUN = Run(
+RUN = RunSpec(
     n_timesteps=800,
     eval_freq=200,
     eval_episodes=2,

@@ -22,10 +22,10 @@ from sb3_sparse.zoo.computing import (
     computing_in,
     gradient_steps_of,
 )
-from sb3_sparse.zoo.inspect import inspect_model
+from sb3_sparse.zoo.inspection import inspect_model
 from sb3_sparse.zoo.record import read_record, write_record
-from sb3_sparse.zoo.run import Run
-from sb3_sparse.zoo.train import resume, train
+from sb3_sparse.zoo.spec import RunSpec
+from sb3_sparse.zoo.training import resume, train
 
 LARGE = {"net_arch": [200, 200], "batch_size": 16, "learning_starts": 50, "update_interval": 20}
 QUICK = dict(eval_freq=200, eval_episodes=1)
@@ -47,8 +47,8 @@ class CtrlC(BaseCallback):
         return True
 
 
-def run(method: str = "rigl", steps: int = 300, **hyperparams) -> Run:
-    return Run(method=method, n_timesteps=steps, hyperparams={**LARGE, **hyperparams}, **QUICK)
+def run(method: str = "rigl", steps: int = 300, **hyperparams) -> RunSpec:
+    return RunSpec(method=method, n_timesteps=steps, hyperparams={**LARGE, **hyperparams}, **QUICK)
 
 
 def layers_of(folder: Path) -> dict[str, str]:
@@ -109,7 +109,7 @@ def test_sittings_that_came_to_nothing_are_forgotten(trained):
 def test_inspect_tells_what_the_record_says_not_what_would_be_chosen_here(
     trained, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr("sb3_sparse.zoo.inspect.choose", lambda *_: [])
+    monkeypatch.setattr("sb3_sparse.zoo.inspection.choose", lambda *_: [])
     for path in (trained, trained / "best_model.zip"):
         found = inspect_model(path)
         assert [layer.compute for layer in found.report.layers] == ["non-zeros"] * 3

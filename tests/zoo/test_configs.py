@@ -13,8 +13,8 @@ from sb3_sparse.errors import ConfigError
 from sb3_sparse.zoo import config_path
 from sb3_sparse.zoo.configs import METHODS, entry_of, evaluation_of
 from sb3_sparse.zoo.environments import is_atari
-from sb3_sparse.zoo.run import Run, algorithms
 from sb3_sparse.zoo.settings import CALLBACK, ZOO_KEYS, _arguments, method_of
+from sb3_sparse.zoo.spec import RunSpec, algorithms
 
 SHIPPED = sorted(configs.config_root().glob("*/*.yml"))
 MUJOCO_IDS = [f"{name}-{version}" for name in paper.MUJOCO for version in ("v5", "v4")]
@@ -192,11 +192,11 @@ def test_an_environment_without_settings_says_which_file_which_keys_and_what_to_
     path = tmp_path / "mine.yml"
     path.write_text("Pendulum-v1: {n_timesteps: 5}\n")
     with pytest.raises(ConfigError, match=r"mine\.yml has no settings for 'CartPole-v1'") as caught:
-        Run(conf_file=str(path)).settings()
+        RunSpec(conf_file=str(path)).settings()
     assert "its keys are Pendulum-v1" in str(caught.value)
     assert "`default` for every environment" in str(caught.value)
     with pytest.raises(ConfigError, match="`atari` for every Atari game"):
-        Run(conf_file=str(path), env_id="PongNoFrameskip-v4").settings()
+        RunSpec(conf_file=str(path), env_id="PongNoFrameskip-v4").settings()
 
 
 @pytest.mark.parametrize(
@@ -235,7 +235,7 @@ def test_a_file_that_is_wrong_says_how(content, message, tmp_path):
     path = tmp_path / "mine.yml"
     path.write_text(content)
     with pytest.raises(ConfigError, match=message):
-        Run(conf_file=str(path)).settings()
+        RunSpec(conf_file=str(path)).settings()
 
 
 def test_what_is_not_shipped_names_what_is(tmp_path):
@@ -244,7 +244,7 @@ def test_what_is_not_shipped_names_what_is(tmp_path):
     with pytest.raises(ConfigError, match="only for dense, prune, static, set, rigl"):
         config_path("gmp", "sac")
     with pytest.raises(ConfigError, match="no config file"):
-        Run(conf_file=str(tmp_path / "none.yml")).settings()
+        RunSpec(conf_file=str(tmp_path / "none.yml")).settings()
 
 
 def test_entries_are_copies():
@@ -254,6 +254,6 @@ def test_entries_are_copies():
 
 
 def test_all_environments_of_the_paper_exist():
-    Run(env_id="PongNoFrameskip-v4")  # registers the games
+    RunSpec(env_id="PongNoFrameskip-v4")  # registers the games
     for env_id in (*paper.CLASSIC, *MUJOCO_IDS, *GAME_IDS):
         assert env_id in gym.registry

@@ -22,14 +22,14 @@ from sb3_sparse.studies import Study, run_study, status_of
 from sb3_sparse.tuning import tune
 from sb3_sparse.tuning.backend import optuna
 from sb3_sparse.tuning.spaces import Space
-from sb3_sparse.zoo.enjoy import enjoy
 from sb3_sparse.zoo.environments import import_packages, plain_id
 from sb3_sparse.zoo.finetune import evaluation_envs, training_envs, write_run_files
 from sb3_sparse.zoo.folder import arguments_of
-from sb3_sparse.zoo.inspect import inspect_model
-from sb3_sparse.zoo.run import Run
+from sb3_sparse.zoo.inspection import inspect_model
 from sb3_sparse.zoo.saved import find_saved
-from sb3_sparse.zoo.train import resume, train
+from sb3_sparse.zoo.scoring import enjoy
+from sb3_sparse.zoo.spec import RunSpec
+from sb3_sparse.zoo.training import resume, train
 
 SOURCE = """
 import gymnasium as gym
@@ -76,7 +76,9 @@ def fresh(package):
 def trained(package, tmp_path_factory):
     """Folder of a run."""
     forget()
-    return train(Run(env_id="tiny_envs:Tiny-v0", **SHORT), tmp_path_factory.mktemp("logs")).folder
+    return train(
+        RunSpec(env_id="tiny_envs:Tiny-v0", **SHORT), tmp_path_factory.mktemp("logs")
+    ).folder
 
 
 def test_a_run_remembers_the_package_and_lies_in_a_folder_of_the_plain_id(trained):
@@ -96,14 +98,14 @@ def test_a_run_remembers_the_package_and_lies_in_a_folder_of_the_plain_id(traine
     ],
 )
 def test_both_ways_to_name_a_package_are_one(package, env_id, packages, plain):
-    run = Run(env_id=env_id, gym_packages=packages, **SHORT)
+    run = RunSpec(env_id=env_id, gym_packages=packages, **SHORT)
     assert (run.env_id, run.gym_packages) == (plain, ("tiny_envs",))
-    assert Run(**run.as_dict()) == run
-    assert "gym_packages" not in Run(**SHORT).as_dict()  # as files written before have it
+    assert RunSpec(**run.as_dict()) == run
+    assert "gym_packages" not in RunSpec(**SHORT).as_dict()  # as files written before have it
 
 
 def test_a_run_that_reaches_another_process_imports_its_package_there(package):
-    run = Run(env_id="tiny_envs:Tiny-v0", **SHORT)
+    run = RunSpec(env_id="tiny_envs:Tiny-v0", **SHORT)
     content = pickle.dumps(run)
     forget()
     assert pickle.loads(content) == run
@@ -147,7 +149,7 @@ def test_a_zip_elsewhere_takes_the_package_from_the_environments_id(trained, tmp
 def test_an_interrupted_run_goes_on_in_a_new_process(package, tmp_path):
     from sb3_sparse.zoo.record import write_record
 
-    folder = train(Run(env_id="tiny_envs:Tiny-v0", **SHORT), tmp_path).folder
+    folder = train(RunSpec(env_id="tiny_envs:Tiny-v0", **SHORT), tmp_path).folder
     write_record(folder, status="evaluating", trained=True)
     forget()
     assert resume(folder).finished
@@ -177,7 +179,7 @@ def test_a_run_that_rl_zoo_made_is_watched(package, tmp_path):
 
 def test_workers_of_a_tuning_import_it(package, tmp_path):
     space = Space("s", {"gamma": optuna.distributions.CategoricalDistribution([0.9])})
-    tuned = tune(Run(env_id="tiny_envs:Tiny-v0", **SHORT), space, log_folder=tmp_path)
+    tuned = tune(RunSpec(env_id="tiny_envs:Tiny-v0", **SHORT), space, log_folder=tmp_path)
     assert tuned.status.finished, tuned.errors
     assert tuned.study.study_name == "dqn_Tiny-v0_rigl_0.9_s"
 
@@ -194,7 +196,7 @@ def test_studies_name_it_too(named, package, tmp_path):
     given = ["tiny_envs"] if named == "by the caller" else []
     study = Study.read(str(tmp_path / "mine.yml"), "smoke", given)
     (cell,) = study.cells
-    assert cell.run == Run(algo="dqn", env_id="tiny_envs:Tiny-v0", method="dense", **SHORT)
+    assert cell.run == RunSpec(algo="dqn", env_id="tiny_envs:Tiny-v0", method="dense", **SHORT)
     if named == "in the file":
         *_, last = run_study(study, tmp_path / "store", launcher_named("local"), 1)
         assert (last.done, last.failed) == (1, {})
@@ -220,13 +222,13 @@ def test_what_is_wrong_with_a_package_is_said(env_id, message, package):
     (package / "broken_envs.py").write_text("raise RuntimeError('no licence')")
     (package / "needy_envs.py").write_text("import absent")
     with pytest.raises(ConfigError, match=message):
-        Run(env_id=env_id)
+        RunSpec(env_id=env_id)
 
 
 @pytest.mark.parametrize("given", [3, ["a.py/b"], ["my envs"], [3], {"a": 1}])
 def test_packages_that_are_no_names_of_modules_are_refused(given):
     with pytest.raises(ConfigError, match="gym_packages must be names of modules"):
-        Run(gym_packages=given)
+        RunSpec(gym_packages=given)
 
 
 def test_a_package_in_this_folder_is_found_by_saying_so(tmp_path, monkeypatch):

@@ -9,8 +9,8 @@ import pytest
 from stable_baselines3 import DQN, PPO, SAC
 
 from sb3_sparse.errors import ConfigError
-from sb3_sparse.zoo.run import Run
 from sb3_sparse.zoo.settings import CALLBACK, apply_overrides, method_of, parse_overrides
+from sb3_sparse.zoo.spec import RunSpec
 
 
 def base(**more):
@@ -79,7 +79,7 @@ def test_unknown_names_are_refused(name, message):
 
 def test_a_schedule_without_a_callback_is_refused():
     with pytest.raises(ConfigError, match="update_interval means nothing here"):
-        Run(method="dense", hyperparams={"update_interval": 5}).settings()
+        RunSpec(method="dense", hyperparams={"update_interval": 5}).settings()
 
 
 def test_texts_are_read_as_the_zoo_writes_them():
@@ -124,7 +124,7 @@ def test_the_method_is_read_off_the_callback_or_the_sparsity():
 
 
 def test_what_the_user_wants_wins_over_the_config():
-    run = Run(
+    run = RunSpec(
         algo="sac",
         env_id="Ant-v5",
         method="set",
@@ -175,15 +175,15 @@ def test_what_the_user_wants_wins_over_the_config():
 )
 def test_wrong_runs_are_refused(arguments, message):
     with pytest.raises(ConfigError, match=message):
-        Run(**arguments).settings()
+        RunSpec(**arguments).settings()
 
 
 @pytest.mark.parametrize(
     "run",
     [
-        Run(method="dense", hyperparams={"sparsity": 0.5}),
-        Run(method="dense", match_params=0.9, hyperparams={"policy_kwargs": {"sparsity": 0.5}}),
-        Run(method="rigl", hyperparams={"callback": None}),
+        RunSpec(method="dense", hyperparams={"sparsity": 0.5}),
+        RunSpec(method="dense", match_params=0.9, hyperparams={"policy_kwargs": {"sparsity": 0.5}}),
+        RunSpec(method="rigl", hyperparams={"callback": None}),
     ],
 )
 def test_overrides_cannot_turn_a_method_into_another(run):
@@ -202,7 +202,7 @@ def test_the_callback_is_known_by_any_path():
 @pytest.mark.parametrize("value", ["1e-3", "fast", "lin_", "lin_x"])
 def test_a_learning_rate_that_is_text_is_explained(value):
     with pytest.raises(ConfigError, match=r"!!float 1e-3|lin_ and a number"):
-        Run(hyperparams={"learning_rate": value}).settings()
+        RunSpec(hyperparams={"learning_rate": value}).settings()
 
 
 def test_a_file_of_ones_own_decides_the_method(tmp_path):
@@ -211,23 +211,23 @@ def test_a_file_of_ones_own_decides_the_method(tmp_path):
         "default:\n  policy: SparsePolicy\n  n_timesteps: !!float 1e3\n"
         '  policy_kwargs: "dict(sparsity=0.5, net_arch=[8])"\n'
     )
-    settings = Run(conf_file=str(path)).settings()
+    settings = RunSpec(conf_file=str(path)).settings()
     assert method_of(settings) == "static"
     assert settings["policy_kwargs"] == {"sparsity": 0.5, "net_arch": [8]}
     assert type(settings["n_timesteps"]) is int
     with pytest.raises(ConfigError, match="trains with method 'static', not 'rigl'"):
-        Run(conf_file=str(path), method="rigl").settings()
+        RunSpec(conf_file=str(path), method="rigl").settings()
 
 
 def test_a_shipped_file_can_be_named():
-    run = Run(env_id="PongNoFrameskip-v4", conf_file="dqn_impala", method="prune")
+    run = RunSpec(env_id="PongNoFrameskip-v4", conf_file="dqn_impala", method="prune")
     assert run.config.name == "dqn_impala.yml"
     assert run.config.parent.name == "prune"
 
 
 def test_a_run_survives_being_written_down():
-    run = Run(algo="ppo", env_id="Ant-v4", hyperparams={"gamma": 0.9}, eval_episodes=3)
-    assert Run(**run.as_dict()) == run
+    run = RunSpec(algo="ppo", env_id="Ant-v4", hyperparams={"gamma": 0.9}, eval_episodes=3)
+    assert RunSpec(**run.as_dict()) == run
     assert run.evaluation() == {"eval_freq": 2000, "eval_episodes": 3}
 
 
@@ -238,12 +238,12 @@ def test_numpys_numbers_are_pythons_in_the_settings_and_on_record():
         sparsity=np.float32(0.5),
         hyperparams={"gamma": np.float64(0.9), "net_arch": [np.int64(8)], "batch_size": np.int8(4)},
     )
-    run = Run(**given)
-    assert run == Run(
+    run = RunSpec(**given)
+    assert run == RunSpec(
         seed=3,
         n_timesteps=100,
         sparsity=0.5,
         hyperparams={"gamma": 0.9, "net_arch": [8], "batch_size": 4},
     )
-    assert Run(**json.loads(json.dumps(run.as_dict()))) == run
+    assert RunSpec(**json.loads(json.dumps(run.as_dict()))) == run
     assert json.loads(json.dumps(run.settings())) == run.settings()

@@ -7,9 +7,9 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_sparse.zoo.run import Run
+from sb3_sparse.zoo.spec import RunSpec
 from sb3_sparse.zoo.speed import denormals_as_zero, use_few_threads
-from sb3_sparse.zoo.train import train
+from sb3_sparse.zoo.training import train
 
 VECTOR = spaces.Box(-1.0, 1.0, (4,))
 
@@ -42,7 +42,7 @@ class Products(BaseCallback):
 
 def test_a_run_trains_without_them_and_leaves_the_process_as_it_was(tmp_path):
     products = Products()
-    run = Run(n_timesteps=20, eval_freq=20, eval_episodes=1, hyperparams={"net_arch": [4]})
+    run = RunSpec(n_timesteps=20, eval_freq=20, eval_episodes=1, hyperparams={"net_arch": [4]})
     train(run, tmp_path, [products])
     assert set(products.seen) == {0.0}
     assert product() > 0.0

@@ -7,7 +7,7 @@ import pytest
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.studies import Study
 from sb3_sparse.zoo.configs import read_yaml
-from sb3_sparse.zoo.run import Run
+from sb3_sparse.zoo.spec import RunSpec
 from sb3_sparse.zoo.strictyaml import parse
 
 
@@ -52,7 +52,7 @@ def test_every_file_is_read_so(tmp_path):
     said = r"mine\.yml is no valid YAML: the key 'CartPole-v1' stands in line 1 and again in line 2"
     for read in (
         lambda: read_yaml(path),
-        lambda: Run(conf_file=str(path)).settings(),
+        lambda: RunSpec(conf_file=str(path)).settings(),
         lambda: Study.read(str(path), "small"),
     ):
         with pytest.raises(ConfigError, match=said):

@@ -19,22 +19,22 @@ from support import ALGORITHMS
 
 from sb3_sparse.errors import ConfigError, CorruptStateError, Diverged, Unwritable
 from sb3_sparse.zoo.checkpoint import last_checkpoint
-from sb3_sparse.zoo.enjoy import enjoy
 from sb3_sparse.zoo.folder import new_run_folder
 from sb3_sparse.zoo.record import read_record, write_record
 from sb3_sparse.zoo.replay import BufferSaver, restore_buffer
-from sb3_sparse.zoo.run import Run, algorithms
-from sb3_sparse.zoo.train import resume, train
+from sb3_sparse.zoo.scoring import enjoy
+from sb3_sparse.zoo.spec import RunSpec, algorithms
+from sb3_sparse.zoo.training import resume, train
 from sb3_sparse.zoo.watch import Watch
 
 SMALL = {"net_arch": [16, 16], "batch_size": 16}
 QUICK = dict(eval_freq=200, eval_episodes=2)
-DQN_RUN = Run(
+DQN_RUN = RunSpec(
     n_timesteps=1000,
     hyperparams={**SMALL, "learning_starts": 50, "update_interval": 20},
     **QUICK,
 )
-PPO_RUN = Run(
+PPO_RUN = RunSpec(
     algo="ppo",
     env_id="Pendulum-v1",
     method="set",
@@ -90,7 +90,7 @@ def test_the_folder_is_the_zoos_plus_sparsity_json(tmp_path):
 def test_sparsity_json_says_what_was_trained_and_how_sparse_it_is(tmp_path):
     outcome = train(DQN_RUN, tmp_path)
     record = json.loads((outcome.folder / "sparsity.json").read_text())
-    assert Run(**record["run"]) == DQN_RUN
+    assert RunSpec(**record["run"]) == DQN_RUN
     assert (record["status"], record["method"], record["num_timesteps"]) == (
         "finished",
         "rigl",
@@ -114,7 +114,7 @@ def test_sparsity_json_says_what_was_trained_and_how_sparse_it_is(tmp_path):
 
 
 def test_the_best_policy_of_pruning_is_pruned(tmp_path):
-    run = Run(
+    run = RunSpec(
         method="prune", n_timesteps=1500, hyperparams={**SMALL, "update_interval": 20}, **QUICK
     )
     outcome = train(run, tmp_path)
@@ -463,7 +463,7 @@ def test_an_environment_that_breaks_loses_nothing_of_a_trained_run(tmp_path, mon
     def die(*args, **kwargs):
         raise RuntimeError("no simulator")
 
-    monkeypatch.setattr("sb3_sparse.zoo.train.final_results", die)
+    monkeypatch.setattr("sb3_sparse.zoo.training.final_results", die)
     with pytest.raises(RuntimeError, match="no simulator"):
         train(DQN_RUN, tmp_path)
     folder = tmp_path / "dqn" / "CartPole-v1_1"
@@ -508,7 +508,7 @@ def test_a_run_that_died_in_its_last_evaluation_only_does_that_again(tmp_path, m
     def die(*args, **kwargs):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("sb3_sparse.zoo.train.final_results", die)
+    monkeypatch.setattr("sb3_sparse.zoo.training.final_results", die)
     with pytest.raises(KeyboardInterrupt):
         train(DQN_RUN, tmp_path)
     monkeypatch.undo()
@@ -534,7 +534,7 @@ def test_a_resume_needs_nothing_but_the_run(tmp_path, monkeypatch):
     run = replace(DQN_RUN, conf_file=str(path))
     stopped = train(run, tmp_path, [Stop(300)])
     path.unlink()
-    monkeypatch.setattr("sb3_sparse.zoo.run.evaluation_of", None)
+    monkeypatch.setattr("sb3_sparse.zoo.spec.evaluation_of", None)
     assert resume(stopped.folder).finished
     assert evaluations(stopped.folder)[0] == [200, 400, 600, 800, 1000]
 
@@ -551,7 +551,7 @@ def test_masks_move_after_a_resume_as_the_schedule_says(tmp_path):
 
 
 def test_a_dense_run_of_equal_parameters_says_what_it_reached(tmp_path):
-    run, seen = Run(method="dense", match_params=0.9, n_timesteps=200, **QUICK), Seen()
+    run, seen = RunSpec(method="dense", match_params=0.9, n_timesteps=200, **QUICK), Seen()
     outcome = train(run, tmp_path, watch=seen)
     record = read_record(outcome.folder)
     match = record["match"]
@@ -575,7 +575,7 @@ def test_tensorboard_goes_on_in_the_same_folder(tmp_path):
 
 def test_noise_and_other_wrappers_come_from_the_settings(tmp_path):
     wrapper = [{"sb3_sparse.wrappers.ObservationNoise": {"sigma": 0.1, "std": [1, 1, 1, 1]}}]
-    run = Run(n_timesteps=200, hyperparams={"env_wrapper": wrapper, **SMALL}, **QUICK)
+    run = RunSpec(n_timesteps=200, hyperparams={"env_wrapper": wrapper, **SMALL}, **QUICK)
     outcome = train(run, tmp_path)
     assert outcome.finished
     assert enjoy(outcome.folder, episodes=2).episodes == 2
@@ -630,7 +630,7 @@ def test_the_algorithms_are_those_with_a_sparse_policy():
 @pytest.mark.parametrize("algo", sorted(algorithms()))
 def test_every_method_and_algorithm_runs_by_its_config(method, algo, tmp_path):
     discrete = algo in ("dqn", "qrdqn")
-    run = Run(
+    run = RunSpec(
         algo=algo,
         env_id="CartPole-v1" if discrete else "Pendulum-v1",
         method=method,
@@ -650,7 +650,7 @@ def test_every_method_and_algorithm_runs_by_its_config(method, algo, tmp_path):
 
 def test_an_atari_run_stacks_frames_resumes_and_is_filmed(tmp_path, monkeypatch):
     small = {"channels": [2, 2, 2], "features_dim": 8}
-    run = Run(
+    run = RunSpec(
         env_id="PongNoFrameskip-v4",
         conf_file="dqn_impala",
         n_timesteps=60,

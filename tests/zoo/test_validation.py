@@ -17,8 +17,8 @@ from sb3_sparse.tuning.backend import optuna
 from sb3_sparse.tuning.spaces import check_space
 from sb3_sparse.zoo.arguments import kind_of
 from sb3_sparse.zoo.configs import METHODS, config_root, read_yaml
-from sb3_sparse.zoo.run import Run, algorithms
 from sb3_sparse.zoo.settings import Names
+from sb3_sparse.zoo.spec import RunSpec, algorithms
 from sb3_sparse.zoo.validation import OF_SPARSITY, check_settings
 
 STEPS, SHARE = "a whole number, 1 or more", r"a number in \[0, 1\]"
@@ -128,7 +128,7 @@ ENVS = {"dqn": "CartPole-v1", "qrdqn": "CartPole-v1"}
 
 
 def made(algo, **more):
-    return Run(algo=algo, env_id=ENVS.get(algo, "Pendulum-v1"), **more)
+    return RunSpec(algo=algo, env_id=ENVS.get(algo, "Pendulum-v1"), **more)
 
 
 @pytest.mark.parametrize(("algo", "name", "values", "allowed"), WRONG)
@@ -177,9 +177,9 @@ def test_the_same_table_serves_files_options_studies_and_spaces(tmp_path):
     }
     config.write_text(yaml.safe_dump({"default": entry}))
     with pytest.raises(ConfigError, match=said):
-        Run(conf_file=str(config)).settings()
+        RunSpec(conf_file=str(config)).settings()
     with pytest.raises(ConfigError, match=said):
-        Run(hyperparams={"gamma": 5}).settings()
+        RunSpec(hyperparams={"gamma": 5}).settings()
     study = tmp_path / "study.yml"
     runs = [
         {"algo": "dqn", "env_id": "CartPole-v1", "method": "dense", "vary": {"gamma": [0.9, 5]}}
@@ -189,10 +189,10 @@ def test_the_same_table_serves_files_options_studies_and_spaces(tmp_path):
     with pytest.raises(ConfigError, match=f"study.yml, scale smoke: {said}"):
         Study.read(str(study), "smoke")
     with pytest.raises(ConfigError, match=said):
-        check_space(choices(gamma=[0.9, 5]), Run())
+        check_space(choices(gamma=[0.9, 5]), RunSpec())
     high = optuna.distributions.FloatDistribution(0.9, 5)
     with pytest.raises(ConfigError, match=r"gamma must be a number in \[0, 1\]; got [1-5]\."):
-        check_space(Space("mine", {"gamma": high}), Run())
+        check_space(Space("mine", {"gamma": high}), RunSpec())
 
 
 @pytest.mark.parametrize(
@@ -233,7 +233,7 @@ def test_the_same_table_serves_files_options_studies_and_spaces(tmp_path):
 def test_a_key_that_nothing_takes_is_refused_with_the_nearest_or_its_place(changed, said):
     entry = {"policy": "SparsePolicy", "n_timesteps": 9, "policy_kwargs": {"sparsity": 0.5}}
     with pytest.raises(ConfigError, match=said):
-        Run(entry={**entry, **changed}).settings()
+        RunSpec(entry={**entry, **changed}).settings()
 
 
 @pytest.mark.parametrize(
@@ -262,10 +262,10 @@ def test_a_sparsity_that_training_would_not_reach_is_refused(initial, final, met
     if method is not None:
         entry["callback"] = [{"sb3_sparse.SparsityCallback": {"method": method}}]
     if said is None:
-        Run(entry=entry).settings()
+        RunSpec(entry=entry).settings()
         return
     with pytest.raises(ConfigError, match=said):
-        Run(entry=entry).settings()
+        RunSpec(entry=entry).settings()
 
 
 class Weekly(SparsityCallback):
@@ -283,6 +283,6 @@ def test_a_subclass_of_the_callback_counts_as_it_and_keeps_its_arguments(monkeyp
         "policy_kwargs": {"sparsity": 0.5},
         "callback": {"sb3_sparse.zoo.Weekly": {"method": "rigl", "weekday": 3}},
     }
-    Run(entry=entry, method="rigl").settings()
+    RunSpec(entry=entry, method="rigl").settings()
     with pytest.raises(ConfigError, match="trains with method 'rigl', not 'static'"):
-        Run(entry=entry, method="static").settings()
+        RunSpec(entry=entry, method="static").settings()

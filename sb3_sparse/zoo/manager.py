@@ -23,7 +23,7 @@ from sb3_sparse.zoo.checkpoint import REPLAY_BUFFER
 from sb3_sparse.zoo.mujoco import mujoco_warns_once
 from sb3_sparse.zoo.record import write_record
 from sb3_sparse.zoo.replay import end_episodes, restore_buffer
-from sb3_sparse.zoo.run import Run, algorithms
+from sb3_sparse.zoo.spec import RunSpec, algorithms
 
 try:
     from rl_zoo3.callbacks import SaveVecNormalizeCallback
@@ -33,7 +33,7 @@ except ImportError as error:
     raise MissingExtra("training runs", "zoo") from error
 
 
-class Experiment(ExperimentManager):
+class RunManager(ExperimentManager):
     """Makes environments, model and files as ``rl_zoo3.train`` does, for given settings.
 
     :param run: what to train
@@ -47,7 +47,7 @@ class Experiment(ExperimentManager):
 
     def __init__(
         self,
-        run: Run,
+        run: RunSpec,
         settings: Mapping[str, Any],
         folder: Path,
         evaluation: Mapping[str, int],
@@ -179,10 +179,10 @@ def quiet() -> Iterator[None]:
 
 
 def spaces_of(
-    run: Run, settings: Mapping[str, Any], folder: Path, evaluation: Mapping[str, int]
+    run: RunSpec, settings: Mapping[str, Any], folder: Path, evaluation: Mapping[str, int]
 ) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
     """Observation and action space that the policy sees, wrappers and stacking included."""
-    experiment = Experiment(run, settings, folder, evaluation)
+    experiment = RunManager(run, settings, folder, evaluation)
     with quiet():
         hyperparams, _ = experiment.read_hyperparameters()
         _, experiment.env_wrapper, _, experiment.vec_env_wrapper = (

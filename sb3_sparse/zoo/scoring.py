@@ -17,8 +17,8 @@ from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecVideoRecorder
 
 from sb3_sparse.errors import ConfigError, MissingExtra
-from sb3_sparse.zoo.experiment import quiet
 from sb3_sparse.zoo.finetune import environment_of, envs_of, evaluated_deterministically
+from sb3_sparse.zoo.manager import quiet
 from sb3_sparse.zoo.saved import Saved, find_saved
 from sb3_sparse.zoo.watch import counting
 

@@ -29,13 +29,13 @@ from sb3_sparse.zoo.disk import writing
 from sb3_sparse.zoo.divergence import check_networks
 from sb3_sparse.zoo.ending import diverging, recorded
 from sb3_sparse.zoo.evaluation import Evaluated, Evaluation
-from sb3_sparse.zoo.experiment import Experiment, spaces_of
 from sb3_sparse.zoo.folder import new_run_folder
+from sb3_sparse.zoo.manager import RunManager, spaces_of
 from sb3_sparse.zoo.plan import check_start, planned
 from sb3_sparse.zoo.prepare import doubt, explained, prepare
 from sb3_sparse.zoo.record import DIVERGED, NAME, read_record, sparsity_of, write_record
 from sb3_sparse.zoo.results import Outcome, final_results
-from sb3_sparse.zoo.run import Run
+from sb3_sparse.zoo.spec import RunSpec
 from sb3_sparse.zoo.speed import denormals_as_zero, use_few_threads
 from sb3_sparse.zoo.watch import Watch
 
@@ -43,7 +43,7 @@ EVALUATION_ENVS = 10
 
 
 def train(
-    run: Run,
+    run: RunSpec,
     log_folder: Path = Path("logs"),
     callbacks: Sequence[BaseCallback] = (),
     tensorboard_log: str = "",
@@ -93,7 +93,7 @@ def train(
         model = None
         try:
             with explained(doubt(run), run.env_id):
-                experiment = Experiment(run, settings, folder, evaluation, None, tensorboard_log)
+                experiment = RunManager(run, settings, folder, evaluation, None, tensorboard_log)
                 model = experiment.setup()
             with recorded(folder, experiment.env_name, model):
                 return _learn(
@@ -143,7 +143,7 @@ def resume(
                 if start is not None:
                     Evaluated.read(start)  # all is read before anything is replaced
                 stack.enter_context(restored_monitors(folder, start))
-            experiment = Experiment(run, settings, folder, evaluation, start, plan.tensorboard_log)
+            experiment = RunManager(run, settings, folder, evaluation, start, plan.tensorboard_log)
             model = experiment.setup()
         watch = watch or Watch()
         watch.begins(folder, None)
@@ -152,8 +152,8 @@ def resume(
 
 
 def _learn(
-    run: Run,
-    experiment: Experiment,
+    run: RunSpec,
+    experiment: RunManager,
     model: BaseAlgorithm,
     folder: Path,
     start: Path | None,

@@ -41,7 +41,7 @@ OPTIONAL = frozenset({"method", "conf_file", "entry", *COUNTS})
 
 
 @dataclass(frozen=True)
-class Run:
+class RunSpec:
     """One training run. What is None is as the config says.
 
     :param algo: algorithm, e.g. ``"sac"``
@@ -196,7 +196,7 @@ class Run:
         return {name: given[name] or value for name, value in schedule.items()}
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values, from which ``Run(**values)`` makes the same run."""
+        """Plain values, from which ``RunSpec(**values)`` makes the same run."""
         values = {**asdict(self), "hyperparams": dict(self.hyperparams)}
         packages = values.pop("gym_packages")  # named only where there are any, as in old files
         return {**values, "gym_packages": list(packages)} if packages else values
