@@ -1,4 +1,4 @@
-"""What computing on the non-zeros gains in a layer or a gradient step, and which rivals win.
+"""What sparse storage gains in a layer or a gradient step, and which rivals win.
 
 All variants of a case are timed in turn in one process; the medians of the ratios, round by round,
 are what counts. Rows are appended to a CSV file as they come.
@@ -34,7 +34,7 @@ from step_overhead import fused_like_stock, off_policy, on_policy
 from torch.nn import functional
 
 from sb3_sparse.engine.chains import Chain
-from sb3_sparse.engine.linear import CompactLinear
+from sb3_sparse.engine.linear import SparseLinear
 from sb3_sparse.engine.native.library import in_use, instruction_sets, use
 from sb3_sparse.engine.products import TILE, tiles_of
 from sb3_sparse.engine.sequential import chain_up
@@ -68,14 +68,14 @@ def rows_of(
 
 
 def layer_steps(width: int, batch: int, sparsity: float) -> dict[str, Callable[[], Any]]:
-    """Forward and backward of a square layer with ReLU, dense and on its non-zeros."""
+    """Forward and backward of a square layer with ReLU, dense and in sparse storage."""
     random = np.random.default_rng(0)
     nnz = round(width * width * (1 - sparsity))
     flat = np.sort(random.choice(width * width, nnz, replace=False))
     dense, twin = th.nn.Linear(width, width), th.nn.Linear(width, width)
     x = th.randn(batch, width, requires_grad=True)
     grad = th.randn(batch, width)
-    layer = CompactLinear.convert(twin, Structure(flat, (width, width)), is_target=False)
+    layer = SparseLinear.convert(twin, Structure(flat, (width, width)), is_target=False)
     chain = Chain([layer], [th.nn.ReLU()])
     tiles = th.randn(tiles_of(batch), width, TILE, requires_grad=True)
     tiles_grad = th.randn(tiles_of(batch), width, TILE)
@@ -98,10 +98,10 @@ def layer_steps(width: int, batch: int, sparsity: float) -> dict[str, Callable[[
             [x, *dense.parameters()],
             grad,
         ),
-        "non-zeros, tiles": lambda: backward(
+        "sparse, tiles": lambda: backward(
             chain.run(tiles, batch, True, True), [tiles, *layer.parameters()], tiles_grad
         ),
-        "non-zeros, rows": lambda: backward(chain(x), [x, *layer.parameters()], grad),
+        "sparse, rows": lambda: backward(chain(x), [x, *layer.parameters()], grad),
         "torch CSR": lambda: backward(
             functional.relu(with_csr @ turned + layer.bias[:, None]),
             [turned, with_csr, layer.bias],
@@ -126,7 +126,7 @@ def time_single(widths: list[int], sparsities: list[float], rounds: int) -> Iter
             for module in sparse[::2]:
                 flat = np.flatnonzero(random.random(module.weight.numel()) >= sparsity)
                 shape = tuple(module.weight.shape)
-                CompactLinear.convert(module, Structure(flat, shape), is_target=False)
+                SparseLinear.convert(module, Structure(flat, shape), is_target=False)
             chain_up(sparse)
 
             @th.no_grad()
@@ -134,7 +134,7 @@ def time_single(widths: list[int], sparsities: list[float], rounds: int) -> Iter
                 for _ in range(200):
                     network(x)
 
-            steps = {"dense": partial(by, dense), "non-zeros": partial(by, sparse)}
+            steps = {"dense": partial(by, dense), "sparse": partial(by, sparse)}
             times = interleaved(steps, rounds)
             yield from rows_of("one", f"17-{width}-{width}-6", 1, sparsity, times, 200)
 
@@ -179,7 +179,7 @@ def state_bytes(model: Any) -> int:
             tensors[id(parameter.grad)] = parameter.grad
     structures = {}
     for module in policy.modules():
-        if isinstance(module, CompactLinear):
+        if isinstance(module, SparseLinear):
             structures[id(module.structure)] = module.structure
         optimizer = getattr(module, "optimizer", None)
         for state in optimizer.state.values() if optimizer is not None else ():
@@ -216,7 +216,7 @@ def time_steps(
             "dense, stock": stock,
             "dense, fused Adam": make("MlpPolicy", dict(fused)),
             "masked": make("SparsePolicy", dict(sparsity=sparsity, compute="masked")),
-            "non-zeros": make("SparsePolicy", dict(sparsity=sparsity, compute="sparse")),
+            "sparse": make("SparsePolicy", dict(sparsity=sparsity, compute="sparse")),
             "auto": make("SparsePolicy", dict(sparsity=sparsity, compute="auto")),
         }
         report = variants["masked"][0].policy.sparsity_report()
@@ -249,31 +249,31 @@ def time_steps(
 # --- the rule of compute="auto" -----------------------------------------------------------------
 
 BEHIND = 0.05
-"""What auto may take longer than the better of masks and non-zeros, as a share of that."""
+"""What auto may take longer than the better of masked and sparse storage, as a share of that."""
 
 
-def compact_layers(model: Any) -> list[str]:
+def sparse_layers(model: Any) -> list[str]:
     layers = model.policy.sparsity_report().layers
-    return [layer.name for layer in layers if layer.compute == "non-zeros"]
+    return [layer.name for layer in layers if layer.compute == "sparse"]
 
 
 def time_rule(
     algo: str, width: int, sparsity: float, activation: str, sets: list[str], rounds: int
 ) -> Iterator[dict]:
-    """Gradient steps with masks, on non-zeros and by the rule, in each instruction set.
+    """Gradient steps with masks, in sparse storage and by the rule, in each instruction set.
 
-    Where auto has the same layers on non-zeros as one of the other two, it is the same program, and
-    has that one's times.
+    Where auto stores the same layers as one of the other two, it is the same program, and has that
+    one's times.
     """
     steps = max(2, min(20, round(20 * (256 / width) ** 2)))
     make = maker(algo, [width, width], steps)
     kwargs = dict(sparsity=sparsity, activation_fn=getattr(th.nn, activation))
     made = {
         name: make("SparsePolicy", dict(kwargs, compute=compute))
-        for name, compute in (("masked", "masked"), ("non-zeros", "sparse"), ("auto", "auto"))
+        for name, compute in (("masked", "masked"), ("sparse", "sparse"), ("auto", "auto"))
     }
-    chosen = {name: compact_layers(model) for name, (model, _, _) in made.items()}
-    same = [name for name in ("masked", "non-zeros") if chosen[name] == chosen["auto"]]
+    chosen = {name: sparse_layers(model) for name, (model, _, _) in made.items()}
+    same = [name for name in ("masked", "sparse") if chosen[name] == chosen["auto"]]
 
     def stepped(name: str, instructions: str) -> Callable[[], None]:
         def run() -> None:
@@ -283,18 +283,18 @@ def time_rule(
         return run
 
     todo = {"masked": stepped("masked", sets[0])}  # no kernel of ours is in it
-    for name in ("non-zeros",) if same else ("non-zeros", "auto"):
+    for name in ("sparse",) if same else ("sparse", "auto"):
         todo |= {f"{name} {one}": stepped(name, one) for one in sets}
     times = interleaved(todo, rounds)
     for one in sets if same else ():
-        times[f"auto {one}"] = times["masked" if same[0] == "masked" else f"non-zeros {one}"]
+        times[f"auto {one}"] = times["masked" if same[0] == "masked" else f"sparse {one}"]
     yield from rows_of(
         "rule", f"{algo} {width} {activation}", ALGOS[algo][2], sparsity, times, steps
     )
 
 
 def print_rule(rows: Iterable[Mapping[str, Any]]) -> None:
-    """How far auto is behind the better of masks and non-zeros, and where by more than 5 %."""
+    """How far auto is behind the better of the two storages, and where by more than 5 %."""
     cases: dict[tuple[str, str], dict[str, float]] = {}
     for row in rows:
         if row["what"] == "rule":
@@ -304,9 +304,9 @@ def print_rule(rows: Iterable[Mapping[str, Any]]) -> None:
     for (case, sparsity), speedups in cases.items():
         for variant in [name for name in speedups if name.startswith("auto ")]:
             one = variant.removeprefix("auto ")
-            auto, compact = speedups[variant], speedups[f"non-zeros {one}"]
-            told = f"{case} {sparsity} {one}: auto {auto:.2f}x, non-zeros {compact:.2f}x of masked"
-            shares[told] = max(1.0, compact) / auto - 1
+            auto, sparse = speedups[variant], speedups[f"sparse {one}"]
+            told = f"{case} {sparsity} {one}: auto {auto:.2f}x, sparse {sparse:.2f}x of masked"
+            shares[told] = max(1.0, sparse) / auto - 1
     worst = sorted(shares, key=lambda told: -shares[told])
     beyond = [told for told in worst if shares[told] > BEHIND]
     print(f"{len(beyond)} of {len(shares)} cases in which auto is more than {BEHIND:.0%} behind")

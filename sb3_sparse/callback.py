@@ -21,7 +21,8 @@ class SparsityCallback(BaseCallback):
 
     Logged: ``sparsity/total``, ``sparsity/<network>``, ``sparsity/nnz``, ``sparsity/mask_updates``,
     ``sparsity/mask_churn`` (share of the active connections that the last update dropped),
-    ``sparsity/drop_fraction`` and ``sparsity/compact_layers`` (how many compute on non-zeros).
+    ``sparsity/drop_fraction`` and ``sparsity/sparse_storage_layers`` (how many layers store their
+    active connections only).
 
     :param method: ``"static"``, ``"set"``, ``"rigl"``, ``"prune"`` or a registered one
     :param update_interval: gradient steps of a network's own optimizer between two updates
@@ -159,4 +160,4 @@ class SparsityCallback(BaseCallback):
         record("sparsity/mask_updates", max(network.mask_updates for network in networks))
         record("sparsity/mask_churn", max(network.churn for network in networks))
         record("sparsity/drop_fraction", self.plan.drop_fraction_at(sparse.progress))
-        record("sparsity/compact_layers", sum(layer.compact for layer in sparse.layers))
+        record("sparsity/sparse_storage_layers", sum(layer.is_sparse for layer in sparse.layers))

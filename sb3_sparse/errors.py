@@ -100,13 +100,13 @@ class TopologyError(SparsityError, RuntimeError):
 
 
 class MissingKernels(SparsityError, ImportError):
-    """The compiled kernels that compute on non-zeros are absent or do not fit.
+    """The compiled kernels that sparse storage needs are absent or do not fit.
 
     :param reason: what is wrong with them
     """
 
     def __init__(self, reason: str) -> None:
         super().__init__(
-            f"computing on non-zeros needs compiled kernels: {reason}. Reinstall sb3-sparse on a "
+            f"sparse storage needs compiled kernels: {reason}. Reinstall sb3-sparse on a "
             "machine with a C compiler (gcc or clang), or use compute='masked'"
         )

@@ -1,4 +1,4 @@
-"""A compact layer whose connections one thread moves while others compute with it."""
+"""A sparse layer whose connections one thread moves while others compute with it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 import torch as th
 from torch import nn
 
-from sb3_sparse.engine.linear import CompactLinear
+from sb3_sparse.engine.linear import SparseLinear
 from sb3_sparse.engine.structure import Structure
 
 MOVES = 10000
@@ -34,7 +34,7 @@ def largest_while_moving(
     layer = nn.Linear(shape[1], shape[0])
     masks = [random.random(shape) < density for density in densities]
     structures = [Structure.of_mask(mask, mask.shape) for mask in masks]
-    CompactLinear.convert(layer, structures[0], is_target=False)
+    SparseLinear.convert(layer, structures[0], is_target=False)
     layer.bias.data.zero_()
     layer.restructure(structures[0], th.full((structures[0].nnz,), 0.5))
     act, found, done = actor_of(layer), [], threading.Event()

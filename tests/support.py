@@ -22,7 +22,7 @@ class LeastIndex(DropGrow):
 
     name = "least-index"
 
-    def scores(self, layer, moment, candidates, *, dense_grad):
+    def scores(self, layer, update, candidates, *, dense_grad):
         return -candidates.astype(np.float64)
 
 

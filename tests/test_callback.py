@@ -27,7 +27,7 @@ def gradient_spy():
         name = "spy"
         needs_gradient = True
 
-        def scores(self, layer, moment, candidates, *, dense_grad):
+        def scores(self, layer, update, candidates, *, dense_grad):
             seen.setdefault(layer.name, []).append(dense_grad.copy())
             return np.abs(dense_grad[candidates])
 
@@ -86,7 +86,7 @@ def test_a_single_loss_is_handed_over_bit_for_bit(name, gradient_spy):
 
 @pytest.mark.parametrize(("method", "dense"), [("rigl", True), ("set", True), ("static", False)])
 @pytest.mark.parametrize("name", ["SAC", "DQN", "PPO", "TRPO"])
-def test_compact_layers_compute_dense_gradients_for_updates_only(name, method, dense, monkeypatch):
+def test_sparse_layers_compute_dense_gradients_for_updates_only(name, method, dense, monkeypatch):
     computed = []
     outer = products._outer
     monkeypatch.setattr(products, "_outer", lambda *args: computed.append(0) or outer(*args))

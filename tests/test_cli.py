@@ -63,7 +63,7 @@ def test_train_says_what_it_does_and_enjoy_and_inspect_read_it(tmp_path):
     assert 72 <= int(nnz) <= 75
     assert float(density) == round(int(nnz) / 720, 4)
     assert "The run asked for compute='auto'." in done.stdout
-    assert "Trained from step 0: 0 of 3 layers on non-zeros" in done.stdout
+    assert "Trained from step 0: 0 of 3 layers in sparse storage" in done.stdout
 
 
 @pytest.mark.parametrize("compute", ["auto", "sparse"])
@@ -72,11 +72,11 @@ def test_inspect_says_how_large_layers_compute(tmp_path, compute):
     make("SAC", policy_kwargs=kwargs, batch_size=128).save(tmp_path / "model")
     done = sb3_sparse("inspect", "model.zip", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    compact = re.findall(r"^(\S+) .* non-zeros$", done.stdout, re.MULTILINE)
+    sparse = re.findall(r"^(\S+) .* sparse$", done.stdout, re.MULTILINE)
     critics = [f"critic.qf{i}.{j}" for i in (0, 1) for j in (0, 2, 4)]
     heads = ["actor.mu", "actor.log_std"] if compute == "sparse" else []
-    assert compact == ["actor.latent_pi.0", "actor.latent_pi.2", *heads, *critics]
-    chosen = "compute='auto': 8 of 10 layers compute on non-zeros here"
+    assert sparse == ["actor.latent_pi.0", "actor.latent_pi.2", *heads, *critics]
+    chosen = "compute='auto': 8 of 10 layers in sparse storage here"
     assert (chosen in done.stdout) == (compute == "auto")
     assert ("was made with compute='sparse'" in done.stdout) == (compute == "sparse")
 

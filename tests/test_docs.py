@@ -56,13 +56,13 @@ def test_the_method_of_the_documents_trains():
         registry._METHODS.pop("preferential", None)
 
 
-def test_the_compact_model_of_the_documents_trains():
+def test_the_sparse_model_of_the_documents_trains():
     (code,) = python_blocks("docs/compute.md")
     assert "1024, 1024" in code
     small = code.replace("1024, 1024", "24, 24").replace("HalfCheetah-v5", "Pendulum-v1")
     names = {"SAC": SAC, "SparsePolicy": SparsePolicy}
     exec(compile(small, "docs/compute.md", "exec"), names)
-    assert all(layer.compact for layer in names["model"].policy.sparse.layers)
+    assert all(layer.is_sparse for layer in names["model"].policy.sparse.layers)
     names["model"].learn(110)
 
 

@@ -74,7 +74,7 @@ def here(tmp_path_factory) -> dict[str, str]:
 def test_two_models_of_one_process_are_equal(name, width, here):
     model = learned(name, width)
     assert model.policy.sparsity_config.compute == "auto"
-    assert any(layer.compact for layer in model.policy.sparse.layers) == (width == LARGE)
+    assert any(layer.is_sparse for layer in model.policy.sparse.layers) == (width == LARGE)
     assert digest_of(model) == here[f"{name} {width}"]
     assert digest_of(learned(name, width, seed=1)) != here[f"{name} {width}"]
 

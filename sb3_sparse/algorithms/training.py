@@ -18,10 +18,10 @@ from torch import nn
 from torch.nn.modules.module import _has_any_global_hook
 
 from sb3_sparse.engine.activations import ACTIVATIONS, ADJUSTABLE, number_of
-from sb3_sparse.engine.linear import CompactLinear
+from sb3_sparse.engine.changes import ChangeDetector, patched
+from sb3_sparse.engine.linear import SparseLinear
 from sb3_sparse.engine.native.library import why_missing
 from sb3_sparse.engine.paths import parts_of
-from sb3_sparse.engine.watch import Watch, patched
 from sb3_sparse.fused.errors import NotCovered
 from sb3_sparse.fused.machine import Machine
 from sb3_sparse.fused.program import Parts, Program
@@ -32,7 +32,7 @@ from sb3_sparse.policies.storage import KNOWN
 
 HOOKS = itemgetter("_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_pre_hooks")
 SEEN = attrgetter("requires_grad", "_backward_hooks", "_post_accumulate_grad_hooks")
-KNOWN_MODULES = (nn.Linear, CompactLinear, nn.Identity, *ACTIVATIONS)
+KNOWN_MODULES = (nn.Linear, SparseLinear, nn.Identity, *ACTIVATIONS)
 Build = Callable[[Program], None]
 
 
@@ -41,7 +41,7 @@ class Training:
 
     def __init__(self) -> None:
         self._machines: dict[Hashable, Machine] = {}
-        self._watch: Watch | None = None
+        self._changes: ChangeDetector | None = None
         self._hooked: list[dict[str, Any]] = []
         self._tensors: list[Any] = []
         self._seen: list[Any] = []
@@ -80,8 +80,8 @@ class Training:
         if not isinstance(policy, SparsePolicyMixin):
             raise NotCovered(f"the policy, {type(policy).__name__}, is not sparse")
         settings = self._settings_now()
-        if self._watch is None or settings != self._settings or not self._watch.unchanged():
-            self._watch = None
+        if self._changes is None or settings != self._settings or not self._changes.unchanged():
+            self._changes = None
             self._machines.clear()
             _check_policy(policy, methods)
             modules = list(policy.modules())
@@ -90,7 +90,7 @@ class Training:
             self._adjustable = [m for m in modules if isinstance(m, ADJUSTABLE)]
             self._acting = [vars(m) for m in modules if "action_dist" in vars(m)]
             self._settings = self._settings_now()
-            self._watch = Watch(modules)
+            self._changes = ChangeDetector(modules)
         for name in methods:
             if vars(model).get(name) is not policy._modules.get(name) and hasattr(model, name):
                 raise NotCovered(f"{name} is another module in the model than in its policy")
@@ -225,7 +225,7 @@ class Fused(BaseAlgorithm):
     def _setup_model(self) -> None:
         super()._setup_model()  # type: ignore[safe-super]
         if isinstance(self.policy, SparsePolicyMixin):
-            self.policy.quicken()  # also where it has no zeros, and so would stay stock SB3's
+            self.policy.use_kernels()  # also where it has no zeros, and so would stay stock SB3's
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_training"]

@@ -14,7 +14,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from torch import nn
 from torch.utils import _pytree as pytree
 
-from sb3_sparse.analysis.networks import dense_twin, kernels_of, modules_of, specs_of
+from sb3_sparse.analysis.networks import dense_twin, modules_of, prunable_of, specs_of
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.policies.spec import output_layers
@@ -154,7 +154,7 @@ def activity(
     for network, spec in specs_of(twin).items():
         modules = {n: m for n, m in modules_of(twin, spec).items() if id(m) not in seen}
         seen.update(map(id, modules.values()))
-        heads = output_layers(spec, list(kernels_of(twin, spec)))
+        heads = output_layers(spec, list(prunable_of(twin, spec)))
         watched = _Watched(
             [m for m in modules.values() if type(m).__module__ == "torch.nn.modules.activation"],
             [twin.get_submodule(name) for name in sorted(heads)],

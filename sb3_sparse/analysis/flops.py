@@ -10,8 +10,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 
-from sb3_sparse.analysis.networks import kernels_of, modules_of, specs_of
-from sb3_sparse.analysis.passes import Pass, batch_size_of, passes_of
+from sb3_sparse.analysis.networks import modules_of, prunable_of, specs_of
+from sb3_sparse.analysis.passes import PassCounts, batch_size_of, passes_of
 from sb3_sparse.engine.network import SparseNetwork
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.policies.compiled import unwrapped
@@ -57,7 +57,7 @@ class FlopsReport:
     layers: tuple[LayerFlops, ...]
     algorithm: str | None = None
     batch_size: int | None = None
-    passes: tuple[Pass, ...] = ()
+    passes: tuple[PassCounts, ...] = ()
 
     @property
     def networks(self) -> tuple[str, ...]:
@@ -192,22 +192,22 @@ def _owned(policy: BasePolicy) -> dict[str, dict[str, Any]]:
     seen: set[int] = set()
     found: dict[str, dict[str, Any]] = {}
     for network, spec in specs_of(policy).items():
-        kernels = kernels_of(policy, spec)
-        found[network] = {n: m for n, m in kernels.items() if id(m) not in seen}
-        seen.update(map(id, kernels.values()))
+        layers = prunable_of(policy, spec)
+        found[network] = {n: m for n, m in layers.items() if id(m) not in seen}
+        seen.update(map(id, layers.values()))
     return found
 
 
-def _times(policy: BasePolicy, passes: list[Pass]) -> dict[str, float]:
+def _times(policy: BasePolicy, passes: list[PassCounts]) -> dict[str, float]:
     """Forward passes that a layer's work in one gradient step amounts to, for each sample."""
     specs, owned = specs_of(policy), _owned(policy)
-    names = {id(m): name for kernels in owned.values() for name, m in kernels.items()}
+    names = {id(m): name for layers in owned.values() for name, m in layers.items()}
     times = dict.fromkeys(names.values(), 0.0)
     for one in passes:
         modules = modules_of(policy, specs[one.network])
         extractors = [m for m in modules.values() if isinstance(m, BaseFeaturesExtractor)]
         before_actions = {id(m) for extractor in extractors for m in extractor.modules()}
-        for name, module in kernels_of(policy, specs[one.network]).items():
+        for name, module in prunable_of(policy, specs[one.network]).items():
             own = name in owned[one.network]
             if fnmatchcase(name, one.leaves_out) or not (own or one.shares):
                 continue

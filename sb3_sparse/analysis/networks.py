@@ -12,8 +12,8 @@ from stable_baselines3.common.policies import BasePolicy
 from torch import nn
 
 from sb3_sparse.engine.controller import Controller
-from sb3_sparse.engine.kernels import KERNEL_TYPES, UNSUPPORTED_TYPES, Kernel
 from sb3_sparse.engine.plain import make_plain
+from sb3_sparse.engine.prunable import PRUNABLE_TYPES, UNSUPPORTED_TYPES, Prunable
 from sb3_sparse.errors import UnsupportedError
 from sb3_sparse.policies.aliases import supported_algorithms
 from sb3_sparse.policies.compiled import unwrapped
@@ -44,10 +44,10 @@ def specs_of(policy: BasePolicy) -> Mapping[str, NetworkSpec]:
 
 
 def _check_complete(policy: BasePolicy, specs: Mapping[str, NetworkSpec]) -> None:
-    known = {id(module) for name in specs for module in kernels_of(policy, specs[name]).values()}
+    known = {id(module) for name in specs for module in prunable_of(policy, specs[name]).values()}
     targets = tuple(f"{spec.target}." for spec in specs.values() if spec.target is not None)
     for name, module in policy.named_modules():
-        other = isinstance(module, KERNEL_TYPES) and id(module) not in known
+        other = isinstance(module, PRUNABLE_TYPES) and id(module) not in known
         if isinstance(module, UNSUPPORTED_TYPES) or (other and not name.startswith(targets)):
             raise UnsupportedError(
                 f"{name}, a {type(module).__name__} of {type(policy).__name__}, is no Linear or "
@@ -66,10 +66,10 @@ def modules_of(policy: nn.Module, spec: NetworkSpec) -> dict[str, nn.Module]:
     return dict(found.values())
 
 
-def kernels_of(policy: nn.Module, spec: NetworkSpec) -> dict[str, Kernel]:
+def prunable_of(policy: nn.Module, spec: NetworkSpec) -> dict[str, Prunable]:
     """Every Linear and Conv layer that a network runs, shared ones too, by dotted name."""
     modules = modules_of(policy, spec)
-    return {name: module for name, module in modules.items() if isinstance(module, KERNEL_TYPES)}
+    return {name: module for name, module in modules.items() if isinstance(module, PRUNABLE_TYPES)}
 
 
 def parameters_by_network(policy: BasePolicy) -> dict[str, list[str]]:
@@ -90,12 +90,12 @@ def parameters_by_network(policy: BasePolicy) -> dict[str, list[str]]:
 
 
 def connections(policy: BasePolicy) -> dict[str, NDArray[Any] | None]:
-    """The mask of every kernel, flat, by its parameter's name; None where all are active."""
+    """The mask of every weight, flat, by its parameter's name; None where all are active."""
     policy = unwrapped(policy)
     names = {id(p): name for name, p in policy.named_parameters()}
     found: dict[str, NDArray[Any] | None] = {}
     for spec in specs_of(policy).values():
-        for module in kernels_of(policy, spec).values():
+        for module in prunable_of(policy, spec).values():
             found[names[id(module.weight)]] = None
     if isinstance(policy, SparsePolicyMixin):
         for layer in policy.sparse.layers:

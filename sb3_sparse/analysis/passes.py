@@ -13,7 +13,7 @@ from sb3_sparse.errors import ConfigError
 
 
 @dataclass(frozen=True)
-class Pass:
+class PassCounts:
     """Runs of one network in one gradient step, on average and for each sample of the minibatch.
 
     :param network: its name
@@ -35,46 +35,48 @@ class Pass:
     shares: bool = True
 
 
-def _value_based(network: str) -> Callable[[Any], list[Pass]]:
-    return lambda model: [Pass(network, 1, 1), Pass(network, 1, target=True)]
+def _value_based(network: str) -> Callable[[Any], list[PassCounts]]:
+    return lambda model: [PassCounts(network, 1, 1), PassCounts(network, 1, target=True)]
 
 
-def _sac(model: Any) -> list[Pass]:
+def _sac(model: Any) -> list[PassCounts]:
     return [
-        Pass("actor", 2, 1),  # of the observations, and of the next ones
-        Pass("critic", 1, 1),
-        Pass("critic", 1, through=1),  # of the actor's actions
-        Pass("critic", 1, target=True),
+        PassCounts("actor", 2, 1),  # of the observations, and of the next ones
+        PassCounts("critic", 1, 1),
+        PassCounts("critic", 1, through=1),  # of the actor's actions
+        PassCounts("critic", 1, target=True),
     ]
 
 
-def _td3(model: Any) -> list[Pass]:
+def _td3(model: Any) -> list[PassCounts]:
     share = 1 / model.policy_delay
     return [
-        Pass("actor", 1, target=True),
-        Pass("critic", 1, target=True),
-        Pass("critic", 1, 1),
-        Pass("actor", share, share),
-        Pass("critic", share, through=share, leaves_out="critic.qf[!0]*"),  # the first of them
+        PassCounts("actor", 1, target=True),
+        PassCounts("critic", 1, target=True),
+        PassCounts("critic", 1, 1),
+        PassCounts("actor", share, share),
+        PassCounts(
+            "critic", share, through=share, leaves_out="critic.qf[!0]*"
+        ),  # the first of them
     ]
 
 
-def _crossq(model: Any) -> list[Pass]:
+def _crossq(model: Any) -> list[PassCounts]:
     share = 1 / model.policy_delay
     return [
-        Pass("actor", 1),
-        Pass("critic", 2, 2),  # observations and next ones in one minibatch of twice the size
-        Pass("actor", share, share),
-        Pass("critic", share, through=share),
+        PassCounts("actor", 1),
+        PassCounts("critic", 2, 2),  # observations and next ones in one minibatch of twice the size
+        PassCounts("actor", share, share),
+        PassCounts("critic", share, through=share),
     ]
 
 
-def _actor_critic(model: Any) -> list[Pass]:
-    return [Pass("actor", 1, 1, shares=False), Pass("critic", 1, 1, shares=False)]
+def _actor_critic(model: Any) -> list[PassCounts]:
+    return [PassCounts("actor", 1, 1, shares=False), PassCounts("critic", 1, 1, shares=False)]
 
 
 # By name, because sb3_contrib may be absent.
-PASSES: dict[str, Callable[[Any], list[Pass]]] = {
+PASSES: dict[str, Callable[[Any], list[PassCounts]]] = {
     "DQN": _value_based("q_net"),
     "QRDQN": _value_based("quantile_net"),
     "SAC": _sac,
@@ -86,7 +88,7 @@ PASSES: dict[str, Callable[[Any], list[Pass]]] = {
 }
 
 
-def passes_of(model: BaseAlgorithm) -> list[Pass]:
+def passes_of(model: BaseAlgorithm) -> list[PassCounts]:
     """The passes of one gradient step, with the model's own settings.
 
     :raises ConfigError: for an algorithm whose ``train()`` is none of the known ones

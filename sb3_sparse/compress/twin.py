@@ -15,7 +15,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.save_util import save_to_zip_file
 
-from sb3_sparse.engine.masked import MaskedLayer
+from sb3_sparse.engine.masked import MaskedStorage
 from sb3_sparse.errors import ConfigError, UnsupportedError
 from sb3_sparse.loading.zips import check_finite
 from sb3_sparse.policies.aliases import supported_algorithms
@@ -49,7 +49,7 @@ def sparsify(
     A model that is sparse already can only lose connections.
 
     :param model: a model of a supported algorithm, with one of SB3's own policies or a sparse one
-    :param sparsity: removed fraction of the kernels' connections, in [0, 1), or one for each
+    :param sparsity: removed fraction of the weights, in [0, 1), or one for each
         network, e.g. ``{"actor": 0.9, "critic": 0.0}``
     :param distribution: ``"erk"``, ``"er"`` or ``"uniform"``; None: a sparse model's own, else
         ``"erk"``
@@ -168,7 +168,7 @@ def _pruned(model: BaseAlgorithm, data: Mapping[str, Any], saved: State) -> Stat
     """
     policy = _masked_policy(data)
     for layer in policy.sparse.layers:
-        assert isinstance(layer, MaskedLayer)
+        assert isinstance(layer, MaskedStorage)
         layer.set_mask(np.ones(layer.size, dtype=np.bool_))
     weights = {key: value for key, value in saved.items() if not key.endswith(MASK)}
     found = policy.load_state_dict(weights, strict=False)
@@ -180,7 +180,7 @@ def _pruned(model: BaseAlgorithm, data: Mapping[str, Any], saved: State) -> Stat
             f"{', '.join([*missing, *found.unexpected_keys])}"
         )
     for layer in policy.sparse.layers:
-        assert isinstance(layer, MaskedLayer)
+        assert isinstance(layer, MaskedStorage)
         mask = saved.get(f"{layer.name}{MASK}")
         active = np.ones(layer.size, dtype=np.bool_) if mask is None else mask.numpy().ravel()
         has = int(active.sum())

@@ -1,9 +1,9 @@
 """Which linear layers store and compute their active connections only: ``compute="auto"``.
 
 The rule goes by shapes, counts and the kernels' instruction set, so equal seeds give equal runs on
-a machine. A run of layers with nothing but activations between them is one decision, since changing
-between rows and tiles costs most where it happens. It computes on non-zeros if one of its layers is
-large and sparse enough (docs/compute.md has the measurements).
+a machine. A chain of layers with nothing but activations between them is one decision, because
+changing between rows and tiles costs most where it happens. The whole chain becomes sparse if one
+of its layers is large and sparse enough (docs/compute.md has the measurements).
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ from collections.abc import Container, Iterable, Sequence
 import torch as th
 from torch import nn
 
-from sb3_sparse.engine.layers import SparseLayer
 from sb3_sparse.engine.native.library import in_use, why_missing
 from sb3_sparse.engine.optimizers import acts_elementwise
 from sb3_sparse.engine.sequential import ELEMENTWISE
+from sb3_sparse.engine.storage import LayerStorage
 
 LARGE = 2**13
 """Connections of a dense layer below which overhead decides."""
@@ -39,10 +39,10 @@ class AutoCompute:
     def choose(
         self,
         root: nn.Module,
-        layers: Sequence[SparseLayer],
+        layers: Sequence[LayerStorage],
         optimizers: Iterable[th.optim.Optimizer],
     ) -> list[str]:
-        """Names of the layers that compute on non-zeros; none if nothing has changed.
+        """Names of the layers to store as sparse; none if nothing has changed.
 
         :param root: the policy
         :param layers: its sparse layers
@@ -61,8 +61,8 @@ class AutoCompute:
         return choose(root, layers, self.allowed)
 
 
-def choose(root: nn.Module, layers: Iterable[SparseLayer], allowed: Container[str]) -> list[str]:
-    """Names of the layers that compute on non-zeros.
+def choose(root: nn.Module, layers: Iterable[LayerStorage], allowed: Container[str]) -> list[str]:
+    """Names of the layers to store as sparse.
 
     :param root: the policy
     :param layers: its sparse layers
@@ -72,14 +72,14 @@ def choose(root: nn.Module, layers: Iterable[SparseLayer], allowed: Container[st
         return []
     return [
         layer.name
-        for run in runs_of(root, (layer for layer in layers if layer.name in allowed))
-        if any(pays(layer.size, layer.nnz) for layer in run)
-        for layer in run
+        for chain in chains_of(root, (layer for layer in layers if layer.name in allowed))
+        if any(pays(layer.size, layer.nnz) for layer in chain)
+        for layer in chain
     ]
 
 
 def pays(size: int, nnz: int) -> bool:
-    """Whether a layer computes so much quicker on its non-zeros that its run should.
+    """Whether a layer gains so much from sparse storage that its chain should have it.
 
     :param size: connections of the dense layer
     :param nnz: active ones
@@ -88,7 +88,7 @@ def pays(size: int, nnz: int) -> bool:
 
 
 def sparse_enough(size: int, nnz: int) -> bool:
-    """Whether products with the non-zeros of a layer are quicker than dense ones.
+    """Whether products with the active connections of a layer are quicker than dense ones.
 
     :param size: connections of the dense layer
     :param nnz: active ones
@@ -98,23 +98,23 @@ def sparse_enough(size: int, nnz: int) -> bool:
     return nnz <= (size / 2 if size <= HUGE else size * 2 / 5)
 
 
-def runs_of(root: nn.Module, layers: Iterable[SparseLayer]) -> list[list[SparseLayer]]:
+def chains_of(root: nn.Module, layers: Iterable[LayerStorage]) -> list[list[LayerStorage]]:
     """Linear layers in groups that follow each other with nothing but activations between."""
     linear = {id(layer.module): layer for layer in layers if isinstance(layer.module, nn.Linear)}
-    runs: list[list[SparseLayer]] = []
+    chains: list[list[LayerStorage]] = []
     seen: set[int] = set()
     for sequence in root.modules():
         if not isinstance(sequence, nn.Sequential):
             continue
-        run: list[SparseLayer] = []
+        chain: list[LayerStorage] = []
         for module in sequence:
             layer = linear.get(id(module))
             if layer is not None and id(module) not in seen:
                 seen.add(id(module))
-                run.append(layer)
-            elif type(module) not in ELEMENTWISE and run:
-                runs.append(run)
-                run = []
-        if run:
-            runs.append(run)
-    return runs + [[layer] for key, layer in linear.items() if key not in seen]
+                chain.append(layer)
+            elif type(module) not in ELEMENTWISE and chain:
+                chains.append(chain)
+                chain = []
+        if chain:
+            chains.append(chain)
+    return chains + [[layer] for key, layer in linear.items() if key not in seen]

@@ -1,4 +1,4 @@
-"""Runs of compact linear layers: one call of the kernels forward, one backward."""
+"""Chains of sparse linear layers: one call of the kernels forward, one backward."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import torch as th
 from torch import nn
 from torch.autograd import forward_ad
 
-from sb3_sparse.engine.products import Pass, Products
+from sb3_sparse.engine.products import ChainPass, Products
 from sb3_sparse.engine.structure import Structure
 from sb3_sparse.errors import UnsupportedError
 
@@ -32,7 +32,7 @@ class Link(Protocol):
 
 
 class Chain:
-    """Compact layers that follow each other, each perhaps with an activation.
+    """Sparse layers that follow each other, each perhaps with an activation.
 
     :param layers: the layers
     :param activations: what follows each: None, or a module that tells its slope by its result
@@ -61,7 +61,7 @@ class Chain:
             x = x.float()  # of a layer before, which does what autocast says
         if x.dtype != th.float32 or x.device.type != "cpu" or x.shape[-1:] != (self.columns,):
             raise UnsupportedError(
-                f"a layer that computes on non-zeros takes float32 on the CPU with "
+                f"a layer in sparse storage takes float32 on the CPU with "
                 f"{self.columns} features, got {x.dtype} on {x.device} of shape {tuple(x.shape)}; "
                 "use compute='masked' for anything else"
             )
@@ -78,7 +78,7 @@ class Chain:
             structure, values = layer.held() if acting else layer.live()
             structures.append(structure)
             parameters += [values, layer.bias]
-        how = Pass(self.activations, structures, self._references, batch, tiled_in, tiled_out)
+        how = ChainPass(self.activations, structures, self._references, batch, tiled_in, tiled_out)
         if seen:
             return how.by_dense_weights(x, parameters)
         if th.is_grad_enabled() and (

@@ -15,7 +15,6 @@ from sb3_sparse.engine.auto import AutoCompute
 from sb3_sparse.engine.foreign import watch
 from sb3_sparse.engine.gradients import GradientMask
 from sb3_sparse.engine.hooks import Hooks
-from sb3_sparse.engine.layers import SparseLayer, check_masked, save_moments
 from sb3_sparse.engine.network import SparseNetwork
 from sb3_sparse.engine.optimizers import (
     acts_elementwise,
@@ -24,6 +23,7 @@ from sb3_sparse.engine.optimizers import (
 )
 from sb3_sparse.engine.plan import Plan, warn_of_no_plan
 from sb3_sparse.engine.sequential import chain_up
+from sb3_sparse.engine.storage import LayerStorage, check_masked, save_moments
 
 
 class Controller:
@@ -38,7 +38,7 @@ class Controller:
     :param networks: the sparse networks
     :param seed: mask seed, not negative
     :param functional_gradients: whether the algorithm may use ``torch.autograd.grad``
-    :param weight_decay: coupled L2 coefficient, added to the gradient of every kernel
+    :param weight_decay: coupled L2 coefficient, added to the gradient of every weight
     :param auto: chooses the storage of layers; None leaves it as it is
     """
 
@@ -71,7 +71,7 @@ class Controller:
         return {**self.__dict__, "plan": None, "_in_force": bool, "_gradient_masks": {}}
 
     @property
-    def layers(self) -> Iterable[SparseLayer]:
+    def layers(self) -> Iterable[LayerStorage]:
         """Every sparse layer once."""
         return (layer for network in self.networks for layer in network.layers)
 
@@ -128,7 +128,7 @@ class Controller:
             handles.append(optimizer.register_step_post_hook(after))
         return handles
 
-    def compact(self, root: nn.Module, names: Container[str] | None = None) -> None:
+    def to_sparse(self, root: nn.Module, names: Container[str] | None = None) -> None:
         """Store linear layers as their active connections from now on; they stay in place.
 
         :param root: the policy, whose ``Sequential`` modules shall run them as chains
@@ -136,7 +136,7 @@ class Controller:
         :raises UnsupportedError: if their optimizer needs matrices
         """
         for network in self.networks:
-            network.compact(names, self.optimizers)
+            network.to_sparse(names, self.optimizers)
         self._hook_anew(root)
 
     def choose_storage(self, root: nn.Module) -> None:
@@ -146,15 +146,15 @@ class Controller:
         """
         auto = self._auto
         if auto and (chosen := auto.choose(root, list(self.layers), self.optimizers)):
-            self.compact(root, chosen)
+            self.to_sparse(root, chosen)
 
-    def expand(self, root: nn.Module) -> None:
+    def to_masked(self, root: nn.Module) -> None:
         """Store every layer masked from now on.
 
         :param root: the policy
         """
         for network in self.networks:
-            network.expand(self.optimizers)
+            network.to_masked(self.optimizers)
         self._auto = None
         self._hook_anew(root)
 
@@ -234,7 +234,7 @@ class Controller:
             if self.plan is not None:
                 self._update_if_due(network, self.plan)
             if self.weight_decay:
-                add_weight_decay(network.kernels, self.weight_decay)
+                add_weight_decay(network.weights, self.weight_decay)
 
     def _trust(self, optimizer: th.optim.Optimizer, args: object, kwargs: object) -> None:
         """Of optimizers that keep a weight at 0 whose gradient is 0."""
@@ -265,7 +265,7 @@ class Controller:
         for network in self._owned_by(optimizer):
             network.clock += 1
 
-    def note_gradient(self, layer: SparseLayer, dense_grad: th.Tensor) -> None:
+    def note_gradient(self, layer: LayerStorage, dense_grad: th.Tensor) -> None:
         """Hear of a layer's dense gradient at the step that is about to be taken."""
         if layer.name in self._gradient_masks:
             self._gradient_masks[layer.name].dense_grad = lambda: dense_grad
@@ -295,6 +295,6 @@ class Controller:
     def _move(
         self, network: SparseNetwork, plan: Plan, gradients: dict[str, th.Tensor | None]
     ) -> None:
-        moment = plan.moment(network.clock, self.progress, self.seed)
+        update = plan.update_at(network.clock, self.progress, self.seed)
         at_once = plan.update_on == "step"
-        network.move(plan.topology, moment, gradients, self.optimizers, self.soft_targets, at_once)
+        network.move(plan.topology, update, gradients, self.optimizers, self.soft_targets, at_once)

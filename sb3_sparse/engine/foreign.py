@@ -19,8 +19,8 @@ from torch.optim.optimizer import (
     register_optimizer_step_pre_hook,
 )
 
-from sb3_sparse.engine.layers import SparseLayer
 from sb3_sparse.engine.optimizers import acts_elementwise
+from sb3_sparse.engine.storage import LayerStorage
 from sb3_sparse.errors import UnsupportedError
 
 
@@ -28,7 +28,7 @@ class Owner(Protocol):
     """Has sparse layers, and optimizers that it looks after itself."""
 
     @property
-    def layers(self) -> Iterable[SparseLayer]:
+    def layers(self) -> Iterable[LayerStorage]:
         """Every sparse layer once."""
 
     @property
@@ -41,15 +41,15 @@ class _Found(NamedTuple):
 
     changes: int
     parameters: int  # hash of their ids
-    layers: list[ref[SparseLayer]]
+    layers: list[ref[LayerStorage]]
 
-    def alive(self) -> Iterator[SparseLayer]:
+    def alive(self) -> Iterator[LayerStorage]:
         return (layer for reference in self.layers if (layer := reference()) is not None)
 
 
 _owners: WeakSet[Any] = WeakSet()
 _found: WeakKeyDictionary[th.optim.Optimizer, _Found] = WeakKeyDictionary()
-_followed: WeakKeyDictionary[th.optim.Optimizer, WeakKeyDictionary[SparseLayer, object]]
+_followed: WeakKeyDictionary[th.optim.Optimizer, WeakKeyDictionary[LayerStorage, object]]
 _followed = WeakKeyDictionary()
 """The connections that each optimizer's moments of each layer go by."""
 _count: Callable[[], int] = count(1).__next__
@@ -75,7 +75,7 @@ def _before_step(optimizer: th.optim.Optimizer, args: object, kwargs: object) ->
     for layer in _layers_of(optimizer):
         followed = _followed.setdefault(optimizer, WeakKeyDictionary())
         since = followed.get(layer, layer.connections)
-        if layer.compact and since is not layer.connections and not acts_elementwise(optimizer):
+        if layer.is_sparse and since is not layer.connections and not acts_elementwise(optimizer):
             raise UnsupportedError(
                 f"the connections of {layer.name} have moved, and {type(optimizer).__name__} does "
                 "not move each weight by itself, so what it remembers cannot follow them; make a "
@@ -91,7 +91,7 @@ def _after_step(optimizer: th.optim.Optimizer, args: object, kwargs: object) -> 
         layer.remask()
 
 
-def _layers_of(optimizer: th.optim.Optimizer) -> Iterator[SparseLayer]:
+def _layers_of(optimizer: th.optim.Optimizer) -> Iterator[LayerStorage]:
     moved = tuple([id(p) for group in optimizer.param_groups for p in group["params"]])
     parameters = hash(moved)
     found = _found.get(optimizer)
@@ -118,15 +118,15 @@ class Guard:
     optimizers: list[th.optim.Optimizer] = []
     """None that it would look after itself."""
 
-    def __init__(self, layers: Iterable[SparseLayer]) -> None:
+    def __init__(self, layers: Iterable[LayerStorage]) -> None:
         self.layers = list(layers)
         for layer in self.layers:
-            if not layer.compact and not layer.frozen:
+            if not layer.is_sparse and not layer.frozen:
                 hook: Any = partial(_mask_gradient, ref(layer))
                 layer.weight.register_post_accumulate_grad_hook(hook)  # type: ignore[no-untyped-call]
         watch(self)
 
 
-def _mask_gradient(reference: ref[SparseLayer], weight: th.Tensor) -> None:
+def _mask_gradient(reference: ref[LayerStorage], weight: th.Tensor) -> None:
     if (layer := reference()) is not None:
         layer.mask_gradient()

@@ -23,13 +23,13 @@ from torch.nn.modules.module import _has_any_global_hook
 
 from sb3_sparse.engine.activations import ADJUSTABLE, number_of
 from sb3_sparse.engine.chains import watched, watching
-from sb3_sparse.engine.linear import TRIES, CompactLinear
-from sb3_sparse.engine.masked import FLOAT_MASK_KEY, MaskedLayer
+from sb3_sparse.engine.changes import patched
+from sb3_sparse.engine.linear import TRIES, SparseLinear
+from sb3_sparse.engine.masked import FLOAT_MASK_KEY, MaskedStorage
 from sb3_sparse.engine.native.library import bits_of, library, readable, why_missing
 from sb3_sparse.engine.paths import Paths, modules_of, parts_of
 from sb3_sparse.engine.room import Room
 from sb3_sparse.engine.structure import Structure
-from sb3_sparse.engine.watch import patched
 
 MOST_INPUTS = 16
 MOST_STEPS = 64
@@ -84,17 +84,17 @@ class Inference:
         self._places = [sum(self._widths[:i]) for i in range(len(ends))]
         self._total = sum(self._widths)
         self._layers = [step.layer for step in steps]
-        self._compact = [layer for layer in self._layers if isinstance(layer, CompactLinear)]
+        self._sparse = [layer for layer in self._layers if isinstance(layer, SparseLinear)]
         self._activations = [step.activation for step in steps if step.activation is not None]
         self._adjustable = [m for m in self._activations if isinstance(m, ADJUSTABLE)]
-        self._targets = [layer for layer in self._compact if layer.is_target]
+        self._targets = [layer for layer in self._sparse if layer.is_target]
         hooks = ((vars(m)["_forward_hooks"], vars(m)["_forward_pre_hooks"]) for m in modules)
         self._hooks = list(chain.from_iterable(hooks))
         self._tensors: list[th.Tensor] = [
             tensor for layer in self._layers for tensor in _tensors_of(layer) if tensor is not None
         ]
         numbers = {id(tensor): number for number, tensor in enumerate(self._tensors)}
-        self._values = [numbers[id(layer.weight)] for layer in self._compact]
+        self._values = [numbers[id(layer.weight)] for layer in self._sparse]
         self._binding: Binding | None = None
         self._call = library().sb3_sparse_act
 
@@ -159,7 +159,7 @@ class Inference:
     def _leave(self) -> list[th.Tensor] | None:
         """Let the modules compute what the kernels would: without what is inactive."""
         for layer in self._layers:
-            for masked in MaskedLayer.below(layer):
+            for masked in MaskedStorage.below(layer):
                 masked.remask()
         return None
 
@@ -213,7 +213,7 @@ class Inference:
                 return None  # it awaits its copy
         tensors = [tensor.data_ptr() for tensor in self._tensors]
         sizes = list(map(th.Tensor.size, self._tensors))
-        structures = [layer.structure for layer in self._compact]
+        structures = [layer.structure for layer in self._sparse]
         activations = [number_of(module) for module in self._adjustable]
         binding = self._binding
         if (
@@ -234,7 +234,7 @@ class Inference:
         While another thread moves connections a structure may not fit its values for a moment.
         """
         for _ in range(TRIES):
-            structures = [layer.structure for layer in self._compact]
+            structures = [layer.structure for layer in self._sparse]
             # Not detach(), which lets other threads run while it looks at the tensor.
             held = [tensor.data for tensor in self._tensors]
             values = [held[number] for number in self._values]
@@ -256,7 +256,7 @@ class Inference:
     def _arguments(self, structures: Iterator[Structure], held: Iterator[th.Tensor]) -> Any:
         """``step_t`` of every step; None if a tensor is not what the kernels read.
 
-        :param structures: of the compact layers
+        :param structures: of the sparse layers
         :param held: tensors in the order of those of the layers
         """
         fields: list[int] = []
@@ -264,7 +264,7 @@ class Inference:
             shape = layer.out_features, layer.in_features
             sizes: list[tuple[int, ...]] = [shape, (shape[0],), shape]
             start = column = 0
-            if isinstance(layer, CompactLinear):
+            if isinstance(layer, SparseLinear):
                 structure = next(structures)
                 start, column = structure.addresses[:2]
                 sizes[0] = (structure.nnz,)

@@ -7,16 +7,16 @@ from typing import Any
 
 from torch import nn
 
+from sb3_sparse.engine.changes import ChangeDetector
 from sb3_sparse.engine.inference import Inference
 from sb3_sparse.engine.paths import Paths, modules_of
-from sb3_sparse.engine.watch import Watch
 
 
 class KeptInference:
     """An inference that is made anew when modules have changed. Copies and pickles begin empty."""
 
     def __init__(self) -> None:
-        self._watch: Watch | None = None
+        self._changes: ChangeDetector | None = None
         self._inference: Inference | None = None
 
     def __deepcopy__(self, memo: dict[int, Any]) -> KeptInference:
@@ -31,9 +31,9 @@ class KeptInference:
         :param find: the paths, and the modules around them from the outermost, whose hooks are run
             anyhow, to those that the inference passes over
         """
-        if self._watch is None or not self._watch.unchanged():
+        if self._changes is None or not self._changes.unchanged():
             paths, around = find()
-            watch = Watch([*around, *modules_of(paths)])
+            changes = ChangeDetector([*around, *modules_of(paths)])
             self._inference = Inference.of(paths, around[1:])
-            self._watch = watch  # last: another thread may be looking
+            self._changes = changes  # last: another thread may be looking
         return self._inference

@@ -42,7 +42,7 @@ class Snapshot(NamedTuple):
     placed: th.Tensor
 
 
-class CompactLinear(nn.Linear):
+class SparseLinear(nn.Linear):
     """``nn.Linear`` whose Parameter ``weight`` holds the values of the active connections.
 
     It has shape ``(nnz,)``, by rows; where they are says ``structure``. In a state_dict it is what
@@ -61,8 +61,8 @@ class CompactLinear(nn.Linear):
     """Refuses a saved mask that does not go with the layer's sparsity."""
 
     @classmethod
-    def convert(cls, module: nn.Linear, structure: Structure, is_target: bool) -> CompactLinear:
-        """Make ``module`` compact, in place; its Parameter stays the same object."""
+    def convert(cls, module: nn.Linear, structure: Structure, is_target: bool) -> SparseLinear:
+        """Make ``module`` sparse, in place; its Parameter stays the same object."""
         dense = module.weight.detach()
         module.__class__ = cls  # the usual trick, also of torch's own parametrizations
         assert isinstance(module, cls)
@@ -75,7 +75,7 @@ class CompactLinear(nn.Linear):
         module.take_saved(dense)
         return module
 
-    def expand(self) -> None:
+    def to_linear(self) -> None:
         """Become ``nn.Linear`` again, in place; the Parameter stays the same object."""
         dense = self.dense()
         self.__class__ = nn.Linear  # type: ignore[assignment]
@@ -95,7 +95,7 @@ class CompactLinear(nn.Linear):
         check_conversion(fn)
         return super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
 
-    def apply(self, fn: Callable[[nn.Module], Any]) -> CompactLinear:
+    def apply(self, fn: Callable[[nn.Module], Any]) -> SparseLinear:
         """As in torch: ``fn`` may draw the weight anew and sees it dense, shape ``(out, in)``.
 
         What it writes to an inactive connection is dropped.
@@ -222,7 +222,7 @@ class CompactLinear(nn.Linear):
 
 
 def check_conversion(fn: Callable[[th.Tensor], th.Tensor]) -> None:
-    """Refuse what would make a compact layer anything but float32 on the CPU.
+    """Refuse what would make a sparse layer anything but float32 on the CPU.
 
     :param fn: what torch is about to apply to every parameter and buffer
     :raises UnsupportedError: if it changes type or device
@@ -230,7 +230,7 @@ def check_conversion(fn: Callable[[th.Tensor], th.Tensor]) -> None:
     probe = fn(th.empty(0, dtype=th.float32, device="cpu"))
     if probe.device.type != "cpu" or probe.dtype != th.float32:
         raise UnsupportedError(
-            "layers that compute on non-zeros stay float32 on the CPU, and cannot become "
+            "layers in sparse storage stay float32 on the CPU, and cannot become "
             f"{probe.dtype} on {probe.device}; make the policy with compute='masked'"
         )
 

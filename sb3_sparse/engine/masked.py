@@ -12,10 +12,10 @@ from torch import nn
 from torch.utils.hooks import RemovableHandle
 
 from sb3_sparse.engine.gradients import DenseGradient, GradientMask, weakly
-from sb3_sparse.engine.kernels import Kernel
-from sb3_sparse.engine.layers import SparseLayer, moments_of
 from sb3_sparse.engine.linear import MASK_KEY
 from sb3_sparse.engine.native.library import library, readable, why_missing
+from sb3_sparse.engine.prunable import Prunable
+from sb3_sparse.engine.storage import LayerStorage, moments_of
 
 FLOAT_MASK_KEY = "weight_mask_float"
 
@@ -39,7 +39,7 @@ def clear(weight: th.Tensor, mask: th.Tensor) -> None:
         weight.data.mul_(mask)
 
 
-class MaskedLayer(SparseLayer):
+class MaskedStorage(LayerStorage):
     """A layer stored as its dense weight, 0 where inactive, and a boolean mask.
 
     The mask is the buffer ``weight_mask`` of the module and so rides in its state_dict; a float
@@ -50,9 +50,9 @@ class MaskedLayer(SparseLayer):
     :param module: the Linear or Conv layer; it stays in place
     """
 
-    def __init__(self, name: str, module: Kernel) -> None:
+    def __init__(self, name: str, module: Prunable) -> None:
         super().__init__(name, module, tuple(module.weight.shape))
-        self._targets: list[Kernel] = []
+        self._targets: list[Prunable] = []
         self._connections = object()
         self._seen: tuple[int, int] | None = None
         ones = th.ones_like(module.weight, requires_grad=False)
@@ -65,25 +65,25 @@ class MaskedLayer(SparseLayer):
         ]
 
     @staticmethod
-    def of(module: nn.Module) -> MaskedLayer | None:
+    def of(module: nn.Module) -> MaskedStorage | None:
         """The masked layer of a module, if it is one."""
         for hook in module._load_state_dict_post_hooks.values():
             layer = getattr(hook, "__self__", None)
-            if isinstance(layer, MaskedLayer) and layer.module is module:
+            if isinstance(layer, MaskedStorage) and layer.module is module:
                 return layer
         return None
 
     @staticmethod
-    def below(root: nn.Module) -> Iterator[MaskedLayer]:
+    def below(root: nn.Module) -> Iterator[MaskedStorage]:
         """The masked layers of a module and all within it; those of targets are none."""
-        return filter(None, map(MaskedLayer.of, root.modules()))
+        return filter(None, map(MaskedStorage.of, root.modules()))
 
     @property
-    def targets(self) -> Sequence[Kernel]:
+    def targets(self) -> Sequence[Prunable]:
         return self._targets
 
     @property
-    def compact(self) -> bool:
+    def is_sparse(self) -> bool:
         return False
 
     @property
@@ -102,7 +102,7 @@ class MaskedLayer(SparseLayer):
         array: NDArray[np.float32] = self.weight.detach().cpu().numpy().ravel()
         return array
 
-    def add_target(self, module: Kernel) -> None:
+    def add_target(self, module: Prunable) -> None:
         """Make ``module`` a target copy of this layer; it takes the weights that the layer has."""
         self._targets.append(module)
         self._hooks += [
@@ -173,7 +173,7 @@ class MaskedLayer(SparseLayer):
         for state, key, value in moments_of(optimizers, self.weight):
             if value.shape == self.weight.shape:
                 value.mul_(self.float_mask)
-            elif value.shape == (self.nnz,):  # saved by hand from a compact layer
+            elif value.shape == (self.nnz,):  # saved by hand from a sparse layer
                 state[key] = th.zeros_like(self.weight)
                 state[key][self.module.get_buffer(MASK_KEY)] = value
         self.moments_stale = False
@@ -240,7 +240,7 @@ class MaskedGradient(GradientMask):
     :param capturing: whether the dense gradient will be wanted at the next step
     """
 
-    def __init__(self, layer: MaskedLayer, capturing: Callable[[], bool]) -> None:
+    def __init__(self, layer: MaskedStorage, capturing: Callable[[], bool]) -> None:
         super().__init__(capturing)
         self.layer = layer
 

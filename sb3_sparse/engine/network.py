@@ -7,15 +7,15 @@ from collections.abc import Container, Mapping, Sequence
 import torch as th
 from torch import nn
 
-from sb3_sparse.engine.compact import CompactLayer, compacted
 from sb3_sparse.engine.gradients import DenseGradient, GradientMask
-from sb3_sparse.engine.kernels import Kernel
-from sb3_sparse.engine.layers import SparseLayer
-from sb3_sparse.engine.masked import MaskedLayer
+from sb3_sparse.engine.masked import MaskedStorage
 from sb3_sparse.engine.plan import Plan
+from sb3_sparse.engine.prunable import Prunable
+from sb3_sparse.engine.sparse import SparseStorage, to_sparse
+from sb3_sparse.engine.storage import LayerStorage
 from sb3_sparse.sparsity.distributions import active_counts
 from sb3_sparse.sparsity.initialisation import random_mask, sparsity_aware_weights
-from sb3_sparse.topology import Moment, TopologyMethod
+from sb3_sparse.topology import MaskUpdate, TopologyMethod
 
 
 class SparseNetwork:
@@ -23,23 +23,23 @@ class SparseNetwork:
 
     :param name: e.g. ``"actor"``
     :param owner: module whose attribute ``optimizer`` moves the network
-    :param kernels: its layers within the budget, by dotted name
-    :param dense_kernels: its layers left dense, outside the budget
+    :param prunable: its layers within the budget, by dotted name
+    :param dense_layers: its layers left dense, outside the budget
     """
 
     def __init__(
         self,
         name: str,
         owner: nn.Module,
-        kernels: Sequence[tuple[str, Kernel]],
-        dense_kernels: Sequence[tuple[str, Kernel]] = (),
+        prunable: Sequence[tuple[str, Prunable]],
+        dense_layers: Sequence[tuple[str, Prunable]] = (),
     ) -> None:
         self.name = name
         self.owner = owner
-        self.layers: list[SparseLayer] = [
-            MaskedLayer(layer_name, module) for layer_name, module in kernels
+        self.layers: list[LayerStorage] = [
+            MaskedStorage(layer_name, module) for layer_name, module in prunable
         ]
-        self.dense_kernels = list(dense_kernels)
+        self.dense_layers = list(dense_layers)
         self.clock = 0
         """Gradient steps that the owning optimizer has begun."""
         self.mask_updates = 0
@@ -57,13 +57,13 @@ class SparseNetwork:
         return optimizer
 
     @property
-    def kernels(self) -> list[th.Tensor]:
+    def weights(self) -> list[th.Tensor]:
         """Weights of all Linear and Conv layers, the ones left dense too."""
-        dense = (module.weight for _, module in self.dense_kernels)
+        dense = (module.weight for _, module in self.dense_layers)
         return [*(layer.weight for layer in self.layers), *dense]
 
     @property
-    def sparse_layers(self) -> list[SparseLayer]:
+    def sparse_layers(self) -> list[LayerStorage]:
         """Those with connections that are inactive, or may become so."""
         return [layer for layer in self.layers if not layer.always_full]
 
@@ -131,7 +131,7 @@ class SparseNetwork:
             layer.initial_nnz = max(initial_nnz, final_nnz)
             if initial_sparsity == 0.0:
                 continue
-            assert isinstance(layer, MaskedLayer)  # every network begins so
+            assert isinstance(layer, MaskedStorage)  # every network begins so
             mask = random_mask(layer.shape, layer.initial_nnz, seed, layer.name)
             layer.set_mask(mask)
             if gains is not None:
@@ -139,7 +139,7 @@ class SparseNetwork:
                 weights = sparsity_aware_weights(mask, seed, layer.name, gain)
                 layer.write(th.from_numpy(weights))
 
-    def compact(
+    def to_sparse(
         self, names: Container[str] | None, optimizers: Sequence[th.optim.Optimizer]
     ) -> None:
         """Store linear layers as their active connections from now on.
@@ -148,14 +148,14 @@ class SparseNetwork:
         :param optimizers: whose moments follow
         """
         self.layers = [
-            compacted(layer, optimizers) if names is None or layer.name in names else layer
+            to_sparse(layer, optimizers) if names is None or layer.name in names else layer
             for layer in self.layers
         ]
 
-    def expand(self, optimizers: Sequence[th.optim.Optimizer]) -> None:
+    def to_masked(self, optimizers: Sequence[th.optim.Optimizer]) -> None:
         """Store every layer masked from now on."""
         self.layers = [
-            layer.masked(optimizers) if isinstance(layer, CompactLayer) else layer
+            layer.to_masked(optimizers) if isinstance(layer, SparseStorage) else layer
             for layer in self.layers
         ]
 
@@ -189,7 +189,7 @@ class SparseNetwork:
     def move(
         self,
         method: TopologyMethod,
-        moment: Moment,
+        update: MaskUpdate,
         gradients: Mapping[str, th.Tensor | None],
         optimizers: Sequence[th.optim.Optimizer],
         soft_targets: bool,
@@ -198,7 +198,7 @@ class SparseNetwork:
         """Move the masks of all layers that are trained.
 
         :param method: says what to exchange
-        :param moment: when it is
+        :param update: when it is
         :param gradients: dense gradients by layer name
         :param optimizers: whose moments follow
         :param soft_targets: whether targets follow at once
@@ -215,7 +215,7 @@ class SparseNetwork:
                 if gradient is None:
                     continue
                 dense_grad = gradient.detach().cpu().numpy().ravel()
-            exchange = method.exchange(layer, moment, dense_grad=dense_grad)
+            exchange = method.exchange(layer, update, dense_grad=dense_grad)
             if not exchange:
                 continue
             layer.move(

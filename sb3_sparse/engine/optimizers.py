@@ -27,7 +27,7 @@ def check_weight_decay(weight_decay: float, optimizer_kwargs: Mapping[str, Any] 
         raise ConfigError(f"weight_decay must be 0 or more, got {weight_decay}")
     if weight_decay and (optimizer_kwargs or {}).get("weight_decay"):
         raise ConfigError(
-            "weight_decay is given twice: as a policy argument (kernels only) and in "
+            "weight_decay is given twice: as a policy argument (weights only) and in "
             "optimizer_kwargs (all parameters); keep one"
         )
     return float(weight_decay)
@@ -101,13 +101,13 @@ def keep_implementation(
     return {**state_dict, "param_groups": groups}
 
 
-def add_weight_decay(kernels: Iterable[th.Tensor], weight_decay: float) -> None:
-    """Coupled L2: add ``weight_decay * weight`` to the gradient of every kernel that has one.
+def add_weight_decay(weights: Iterable[th.Tensor], weight_decay: float) -> None:
+    """Coupled L2: add ``weight_decay * weight`` to the gradient of every weight that has one.
 
     Before the step and after any clipping, as optimizers with a ``weight_decay`` of their own do
-    it, but for kernels only and whatever the optimizer.
+    it, but for weights only and whatever the optimizer.
     """
     with th.no_grad():
-        for kernel in kernels:
-            if kernel.grad is not None:
-                kernel.grad.add_(kernel, alpha=weight_decay)
+        for tensor in weights:
+            if tensor.grad is not None:
+                tensor.grad.add_(tensor, alpha=weight_decay)

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from torch import nn
 
 from sb3_sparse.engine.activations import ACTIVATIONS
-from sb3_sparse.engine.linear import CompactLinear
+from sb3_sparse.engine.linear import SparseLinear
 
 Paths = Sequence[Sequence[nn.Module]]
 """Modules of each network in the order of computation."""
@@ -19,7 +19,7 @@ def parts_of(path: Iterable[nn.Module]) -> list[tuple[nn.Linear, nn.Module | Non
     """Layers, each with its activation; None if there is anything else."""
     parts: list[tuple[nn.Linear, nn.Module | None]] = []
     for module in _leaves(path):
-        if type(module) in (nn.Linear, CompactLinear):
+        if type(module) in (nn.Linear, SparseLinear):
             assert isinstance(module, nn.Linear)
             parts.append((module, None))
         elif type(module) in ACTIVATIONS and parts and parts[-1][1] is None:

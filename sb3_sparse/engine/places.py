@@ -6,12 +6,12 @@ from collections.abc import Iterable
 
 from torch import nn
 
-from sb3_sparse.engine.layers import SparseLayer
 from sb3_sparse.engine.linear import MASK_KEY
+from sb3_sparse.engine.storage import LayerStorage
 from sb3_sparse.errors import UnsupportedError
 
 
-def check_places(root: nn.Module, layers: Iterable[SparseLayer]) -> None:
+def check_places(root: nn.Module, layers: Iterable[LayerStorage]) -> None:
     """Refuse a policy in which a sparse layer was replaced by another module.
 
     :param root: the policy
@@ -26,7 +26,7 @@ def check_places(root: nn.Module, layers: Iterable[SparseLayer]) -> None:
                 "(load_state_dict, copy_), or make a policy that has the new layer from the "
                 "beginning (net_arch, features_extractor_class or a subclass)"
             )
-        if not layer.compact and MASK_KEY not in layer.module._buffers:
+        if not layer.is_sparse and MASK_KEY not in layer.module._buffers:
             raise UnsupportedError(
                 f"the mask of {layer.name} was taken away, as torch.nn.utils.prune does, which has "
                 "one of the same name; prune with SparsityCallback('prune') or sb3_sparse.sparsify"

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from torch import nn
 
-from sb3_sparse.engine.linear import CompactLinear
-from sb3_sparse.engine.masked import MaskedLayer
+from sb3_sparse.engine.linear import SparseLinear
+from sb3_sparse.engine.masked import MaskedStorage
 from sb3_sparse.engine.sequential import ChainedSequential, unchain
 
 
@@ -17,8 +17,8 @@ def make_plain(root: nn.Module) -> None:
     for module in root.modules():
         if isinstance(module, ChainedSequential):
             unchain(module)
-        elif isinstance(module, CompactLinear):
-            module.expand()
-        elif (layer := MaskedLayer.of(module)) is not None:
+        elif isinstance(module, SparseLinear):
+            module.to_linear()
+        elif (layer := MaskedStorage.of(module)) is not None:
             layer.remask()
             layer.release()

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from sb3_sparse.errors import ConfigError, warn
 from sb3_sparse.sparsity.numeric import is_number, is_whole
 from sb3_sparse.sparsity.schedules import cosine_drop_fraction
-from sb3_sparse.topology import Moment, TopologyMethod, method_named
+from sb3_sparse.topology import MaskUpdate, TopologyMethod, method_named
 
 UPDATE_ON = ("step", "rollout")
 
@@ -62,9 +62,9 @@ class Plan:
         """Whether an update needs dense gradients, be it for what it grows."""
         return self.topology.grows or self.topology.needs_gradient
 
-    def moment(self, step: int, progress: float, seed: int) -> Moment:
-        """The moment that a method is handed."""
-        return Moment(step, progress, self.begin, self.end, self.drop_fraction, seed)
+    def update_at(self, step: int, progress: float, seed: int) -> MaskUpdate:
+        """The update that a method receives."""
+        return MaskUpdate(step, progress, self.begin, self.end, self.drop_fraction, seed)
 
     def drop_fraction_at(self, progress: float) -> float:
         """The drop fraction now; 0 for a method that exchanges nothing."""

@@ -1,7 +1,7 @@
 """What the kernels compute, for autograd: a batch through a chain of layers and back.
 
-Between the layers of a run, and across elementwise activations to the next run, activations stay in
-tiles: ``[ceil(batch / 64), features, 64]``.
+Between the layers of a chain, and across elementwise activations to the next chain, activations
+stay in tiles: ``[ceil(batch / 64), features, 64]``.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def tiles_of(batch: int) -> int:
     return -(-batch // TILE)
 
 
-class Pass(NamedTuple):
+class ChainPass(NamedTuple):
     """One way forth, and perhaps back, of a batch through a chain."""
 
     activations: list[nn.Module | None]
@@ -69,7 +69,7 @@ class Pass(NamedTuple):
             for parameter in (values, bias):
                 if parameter is not None and not readable(parameter):
                     raise UnsupportedError(
-                        "weights and biases of layers that compute on non-zeros must be "
+                        "weights and biases of layers in sparse storage must be "
                         f"contiguous float32 on the CPU, got {parameter.dtype} on "
                         f"{parameter.device} with strides {parameter.stride()}"
                     )
@@ -159,7 +159,7 @@ class Products(th.autograd.Function):
     """A chain on a batch, differentiable by its input, values and biases."""
 
     @staticmethod
-    def forward(ctx: Any, how: Pass, x: th.Tensor, *parameters: Any) -> th.Tensor:
+    def forward(ctx: Any, how: ChainPass, x: th.Tensor, *parameters: Any) -> th.Tensor:
         y, work, arguments = how.forward(x, parameters)
         ctx.how, ctx.arguments = how, arguments
         # A tiled result is looked at on the way back where an activation made it. Where none did,
@@ -170,7 +170,7 @@ class Products(th.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *gradients: Any) -> Any:
-        how: Pass = ctx.how
+        how: ChainPass = ctx.how
         x, work, _, *parameters = ctx.saved_tensors
         needs_x, *needs = ctx.needs_input_grad[1:]
         pairs = list(zip((x, *parameters), (needs_x, *needs), strict=True))
@@ -223,7 +223,7 @@ class Products(th.autograd.Function):
             (ctypes.c_int64 * len(arguments))(*arguments), ctypes.byref(argument)
         )
         if failed:
-            raise MemoryError("no memory for the gradient of a chain of compact layers")
+            raise MemoryError("no memory for the gradient of a chain of sparse layers")
         inputs = how.inputs(x, work) if listening else []
         for i, listener, left in listening:
             listener.note(partial(_outer, left, inputs[i], how.batch))

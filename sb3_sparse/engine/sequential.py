@@ -1,4 +1,4 @@
-"""A ``Sequential`` that runs its compact layers as chains."""
+"""A ``Sequential`` that runs its sparse layers as chains."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from sb3_sparse.engine.activations import ACTIVATIONS, ADJUSTABLE, tells_its_slo
 from sb3_sparse.engine.chains import Chain, watched
 from sb3_sparse.engine.inference import by_modules
 from sb3_sparse.engine.kept import KeptInference
-from sb3_sparse.engine.linear import CompactLinear
+from sb3_sparse.engine.linear import SparseLinear
 
 ELEMENTWISE = (*ACTIVATIONS, nn.Identity)
 """Activations that may work on tiles as they are."""
@@ -21,7 +21,7 @@ HOOKS = ("_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_p
 
 
 class ChainedSequential(nn.Sequential):
-    """A ``Sequential`` that runs its compact layers as chains.
+    """A ``Sequential`` that runs its sparse layers as chains.
 
     Whoever hooks one of its modules, or traces them, gets the modules called one by one, as in
     torch.
@@ -76,7 +76,7 @@ def _steps(modules: Sequence[Any]) -> list[tuple[Any, bool, bool]]:
     groups: list[Any] = []
     for module in modules:
         last = groups[-1] if groups else None
-        if isinstance(module, CompactLinear):
+        if isinstance(module, SparseLinear):
             if isinstance(last, list):
                 last.append((module, None))
             else:
@@ -100,13 +100,13 @@ def _steps(modules: Sequence[Any]) -> list[tuple[Any, bool, bool]]:
 
 
 def chain_up(root: nn.Module) -> None:
-    """Let every ``Sequential`` below ``root`` that has compact layers run them as chains."""
+    """Let every ``Sequential`` below ``root`` that has sparse layers run them as chains."""
     for module in root.modules():
         if type(module) not in (nn.Sequential, ChainedSequential):
             continue
-        if any(isinstance(child, CompactLinear) for child in module.children()):
+        if any(isinstance(child, SparseLinear) for child in module.children()):
             module.__class__ = ChainedSequential
-            # More of them may be compact now.
+            # More of them may be sparse now.
             vars(module).update(_seen=(), _steps=[], _adjustable=[], _kept=KeptInference())
         elif type(module) is ChainedSequential:
             unchain(module)

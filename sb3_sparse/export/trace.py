@@ -10,7 +10,7 @@ import numpy as np
 import torch as th
 from torch import nn
 
-from sb3_sparse.engine.linear import CompactLinear
+from sb3_sparse.engine.linear import SparseLinear
 from sb3_sparse.engine.sequential import ChainedSequential
 from sb3_sparse.errors import UnsupportedError
 from sb3_sparse.export.activations import NAMES, nodes_of
@@ -37,7 +37,7 @@ FAR = 10.0
 RENORM = "BatchRenorm"
 """sb3-contrib's normalisation (CrossQ), known by name: it need not be installed here."""
 DROPOUTS = (nn.Dropout, nn.Dropout1d, nn.Dropout2d, nn.AlphaDropout, nn.FeatureAlphaDropout)
-COMPACT = (CompactLinear.forward, ChainedSequential.forward)
+OWN_FORWARDS = (SparseLinear.forward, ChainedSequential.forward)
 """These compute what torch's do."""
 ALLOWED = (
     f"Linear, Conv2d, MaxPool2d, Flatten, BatchNorm, LayerNorm, Dropout, {NAMES}, and modules "
@@ -244,7 +244,10 @@ class Tracer:
 def _does(module: nn.Module, *kinds: type[Module]) -> TypeGuard[Module]:
     """Whether a module is one of some kinds and computes what they do."""
     forward = type(module).forward
-    return isinstance(module, kinds) and forward in (*(kind.forward for kind in kinds), *COMPACT)
+    return isinstance(module, kinds) and forward in (
+        *(kind.forward for kind in kinds),
+        *OWN_FORWARDS,
+    )
 
 
 def _arrays(module: nn.Linear | nn.Conv2d) -> tuple[Floats, Floats]:

@@ -11,10 +11,10 @@ from torch import nn
 
 from sb3_sparse.engine.auto import sparse_enough
 from sb3_sparse.engine.controller import Controller
-from sb3_sparse.engine.layers import SparseLayer
-from sb3_sparse.engine.linear import CompactLinear
-from sb3_sparse.engine.masked import MaskedLayer
+from sb3_sparse.engine.linear import SparseLinear
+from sb3_sparse.engine.masked import MaskedStorage
 from sb3_sparse.engine.native.library import readable
+from sb3_sparse.engine.storage import LayerStorage
 from sb3_sparse.engine.structure import Structure
 from sb3_sparse.fused.errors import NotCovered
 
@@ -33,7 +33,7 @@ class Stored(NamedTuple):
     structure: Structure | None = None
     flat: th.Tensor | None = None
     mask: th.Tensor | None = None
-    layer: SparseLayer | None = None
+    layer: LayerStorage | None = None
 
     @property
     def size(self) -> int:
@@ -53,13 +53,13 @@ class Storage:
         self._layers = {id(layer.module): layer for layer in layers}
         self._targets = {id(target): layer for layer in layers for target in layer.targets}
         linear = list(modules)
-        self._compact = [module for module in linear if isinstance(module, CompactLinear)]
+        self._sparse = [module for module in linear if isinstance(module, SparseLinear)]
         masked = [self._layers.get(id(module)) for module in linear]
-        self._masked = [layer for layer in masked if isinstance(layer, MaskedLayer)]
+        self._masked = [layer for layer in masked if isinstance(layer, MaskedStorage)]
         followers = [(module.weight, self._targets.get(id(module))) for module in linear]
         self._followers = [
             weight for weight, layer in followers
-            if isinstance(layer, MaskedLayer) and not layer.always_full
+            if isinstance(layer, MaskedStorage) and not layer.always_full
         ]  # fmt: skip
         self._structures: dict[int, tuple[object, Structure, th.Tensor]] = {}
         self._own: dict[int, tuple[nn.Linear, np.ndarray]] = {}
@@ -74,8 +74,8 @@ class Storage:
                 self._rewritten += 1
         return [
             self._rewritten,
-            *(module.structure for module in self._compact),
-            *(module.snapshot for module in self._compact if module.is_target),
+            *(module.structure for module in self._sparse),
+            *(module.snapshot for module in self._sparse if module.is_target),
             *(layer.connections for layer in self._masked),
             *(weight._version for weight in self._followers),
         ]
@@ -86,7 +86,7 @@ class Storage:
         :param follows: whether it is a target that follows its layer at each step
         :raises NotCovered: if it is nothing that the kernels read
         """
-        if isinstance(module, CompactLinear):
+        if isinstance(module, SparseLinear):
             structure, values = module.live()
             if follows and structure is not module.structure:
                 raise NotCovered("a target with other connections than its layer")
@@ -97,7 +97,7 @@ class Storage:
         weight = module.weight
         check_readable(weight)
         layer = self._layers.get(id(module)) or self._targets.get(id(module))
-        if not isinstance(layer, MaskedLayer) or layer.full:
+        if not isinstance(layer, MaskedStorage) or layer.full:
             return Stored(weight, layer=self._layers.get(id(module)))
         sparse = sparse_enough(layer.size, layer.nnz)
         if id(module) in self._layers:
@@ -119,7 +119,7 @@ class Storage:
         return Stored(weight, structure, flat)
 
     def _structure(
-        self, key: int, connections: object, mask: np.ndarray, layer: SparseLayer
+        self, key: int, connections: object, mask: np.ndarray, layer: LayerStorage
     ) -> tuple[Structure, th.Tensor]:
         kept = self._structures.get(key)
         if kept is None or kept[0] is not connections:

@@ -61,7 +61,7 @@ class Tables:
         self._arrays: list[Any] = [(ctypes.c_int64 * 1)()] * 3
         self.per_thread = 0
         decayed = controller.weight_decay and {
-            id(kernel) for network in controller.networks for kernel in network.kernels
+            id(weight) for network in controller.networks for weight in network.weights
         }
         self._decayed = decayed or set()
 

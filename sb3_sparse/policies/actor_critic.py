@@ -45,7 +45,7 @@ class SparseActorCriticPolicy(SparsePolicyMixin, ActorCriticPolicy):
     functional_gradients = True  # TRPO's actor; SB3 does not say which algorithm builds the policy
     _shortcuts: Mapping[str, Shortcut] = {}
 
-    def quicken(self) -> None:
+    def use_kernels(self) -> None:
         if self.use_sde:
             return  # its distribution asks for the actor's features too
         self.action_dist = quick(self.action_dist)

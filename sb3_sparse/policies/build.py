@@ -9,14 +9,14 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
-from sb3_sparse.engine.kernels import KERNEL_TYPES, find_kernels
-from sb3_sparse.engine.masked import MaskedLayer
+from sb3_sparse.engine.masked import MaskedStorage
 from sb3_sparse.engine.network import SparseNetwork
+from sb3_sparse.engine.prunable import PRUNABLE_TYPES, find_prunable
 from sb3_sparse.errors import ConfigError, UnsupportedError, warn
 from sb3_sparse.policies.config import SparsityConfig
 from sb3_sparse.policies.spec import (
     DENSE_WORDS,
-    NetworkKernels,
+    NetworkLayers,
     NetworkSpec,
     input_layers,
     matches,
@@ -48,8 +48,8 @@ def build_networks(
         SparseNetwork(
             name,
             modules[specs[name].owner],
-            kernels=found[name].sparse,
-            dense_kernels=found[name].dense,
+            prunable=found[name].sparse,
+            dense_layers=found[name].dense,
         )
         for name in specs
     ]
@@ -117,28 +117,28 @@ def _find_layers(
     modules: Mapping[str, nn.Module],
     specs: Mapping[str, NetworkSpec],
     config: SparsityConfig,
-) -> dict[str, NetworkKernels]:
+) -> dict[str, NetworkLayers]:
     """The layers of each network; one that several reach belongs to the first."""
     patterns = config.dense_layers
     seen: set[int] = set()
-    found = {name: NetworkKernels() for name in specs}
+    found = {name: NetworkLayers() for name in specs}
     unmatched = set(patterns)
     for network, spec in specs.items():
-        kernels = {}
+        layers = {}
         for root in spec.roots:
             if root not in modules:
                 continue
-            for name, module in find_kernels(
+            for name, module in find_prunable(
                 modules[root], root, lambda name: matches(name, patterns)
             ):
                 if id(module.weight) not in seen:
                     seen.add(id(module.weight))
-                    kernels[name] = module
+                    layers[name] = module
         words = {
-            "input": input_layers(policy, spec, list(kernels)),
-            "output": output_layers(spec, list(kernels)),
+            "input": input_layers(policy, spec, list(layers)),
+            "output": output_layers(spec, list(layers)),
         }
-        for name, module in kernels.items():
+        for name, module in layers.items():
             fits = {p for p in patterns if matches(name, [p])}
             fits |= {word for word in DENSE_WORDS if word in patterns and name in words[word]}
             unmatched -= fits
@@ -147,7 +147,7 @@ def _find_layers(
             kind.append((name, module))
     _check_complete(policy, specs, seen)
     if unmatched:
-        names = [name for kernels in found.values() for name, _ in kernels.sparse + kernels.dense]
+        names = [name for layers in found.values() for name, _ in layers.sparse + layers.dense]
         raise ConfigError(
             f"dense_layers has {', '.join(map(repr, sorted(unmatched)))}, which is no layer of "
             f"this policy; its layers are {', '.join(names)}, or use the words 'input' and 'output'"
@@ -156,9 +156,9 @@ def _find_layers(
 
 
 def _check_complete(policy: nn.Module, specs: Mapping[str, NetworkSpec], seen: set[int]) -> None:
-    """Refuse trained kernels that no network has, which would stay dense unnoticed."""
+    """Reject trained layers that belong to no network, which would stay dense unnoticed."""
     targets = tuple(f"{spec.target}." for spec in specs.values() if spec.target is not None)
-    for name, module in find_kernels(policy, "", lambda _: True):
+    for name, module in find_prunable(policy, "", lambda _: True):
         trained = module.weight.requires_grad and not name.startswith(targets)
         if trained and id(module.weight) not in seen:
             raise UnsupportedError(
@@ -181,7 +181,7 @@ def _add_targets(
             continue
         (root,) = spec.roots
         for name, module in modules[root].named_modules():
-            if not isinstance(module, KERNEL_TYPES):
+            if not isinstance(module, PRUNABLE_TYPES):
                 continue
             layer = layers.get(id(module.weight))
             target = modules[f"{spec.target}.{name}"]
@@ -194,7 +194,7 @@ def _add_targets(
                 )
             if layer is None or id(target) in done:
                 continue
-            assert isinstance(target, KERNEL_TYPES)
+            assert isinstance(target, PRUNABLE_TYPES)
             done.add(id(target))
-            assert isinstance(layer, MaskedLayer)
+            assert isinstance(layer, MaskedStorage)
             layer.add_target(target)

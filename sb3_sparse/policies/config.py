@@ -26,7 +26,7 @@ SPARSITY_MISSING = (
 class SparsityConfig:
     """How sparse a policy shall be.
 
-    :param sparsity: removed fraction of the kernels' connections, in [0, 1), for every network, or
+    :param sparsity: removed fraction of the weights, in [0, 1), for every network, or
         one for each network by name, e.g. ``{"actor": 0.95, "critic": 0.8}``
     :param initial_sparsity: what training starts with; None: the same; 0.0 for pruning
     :param distribution: ``"erk"``, ``"er"`` or ``"uniform"``

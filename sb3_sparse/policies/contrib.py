@@ -12,7 +12,7 @@ from stable_baselines3.common.type_aliases import Schedule
 
 from sb3_sparse.errors import MissingExtra
 from sb3_sparse.policies.acting import Actions
-from sb3_sparse.policies.critics import PassesGradientsOn, SparseCriticsMixin
+from sb3_sparse.policies.critics import SparseCritic, SparseCriticsMixin
 from sb3_sparse.policies.extractors import with_extractor
 from sb3_sparse.policies.gaussian import GaussianActor
 from sb3_sparse.policies.mixin import SparsePolicyMixin
@@ -35,7 +35,7 @@ class SparseTQCActor(GaussianActor, TQCActor):
     """Actor of TQC."""
 
 
-class SparseTQCCritic(PassesGradientsOn, Critic):
+class SparseTQCCritic(SparseCritic, Critic):
     """Quantile critic of TQC."""
 
 
@@ -126,7 +126,7 @@ class SparseCrossQActor(GaussianActor, CrossQActor):
     """Actor of CrossQ."""
 
 
-class SparseCrossQCritic(PassesGradientsOn, CrossQCritic):
+class SparseCrossQCritic(SparseCritic, CrossQCritic):
     """Critic of CrossQ."""
 
 

@@ -27,7 +27,7 @@ def _frozen(module: nn.Module) -> Iterator[None]:
             parameter.requires_grad_(True)
 
 
-class PassesGradientsOn(SparsePart):
+class SparseCritic(SparsePart):
     """A critic whose own weights get no gradient where its actions have one.
 
     That is the actor's loss, in every algorithm: SB3 computes the critic's gradients there too and
@@ -41,7 +41,7 @@ class PassesGradientsOn(SparsePart):
             return super().forward(obs, actions)
 
 
-class SparseContinuousCritic(PassesGradientsOn, ContinuousCritic):
+class SparseContinuousCritic(SparseCritic, ContinuousCritic):
     """Critic of SAC, TD3 and DDPG."""
 
     def q1_forward(self, obs: Any, actions: th.Tensor) -> th.Tensor:
@@ -56,7 +56,7 @@ class SparseCriticsMixin(ActsByPart, SparsePolicyMixin):
 
     acting = "actor"
     actor_class: ClassVar[type[ActingPart]]
-    critic_class: ClassVar[type[PassesGradientsOn]] = SparseContinuousCritic
+    critic_class: ClassVar[type[SparseCritic]] = SparseContinuousCritic
     actor_kwargs: dict[str, Any]
     critic_kwargs: dict[str, Any]
 

@@ -96,11 +96,11 @@ class GaussianActor(ActingPart):
     on_the_way = ("get_action_dist_params",)
     use_sde: bool
 
-    def quicken(self) -> None:
+    def use_kernels(self) -> None:
         """Act and sample with fewer steps from now on; gSDE stays SB3's."""
         if self.use_sde:
             return
-        super().quicken()
+        super().use_kernels()
         distribution = vars(self).get("action_dist")
         if type(distribution) is SquashedDiagGaussianDistribution:
             quick = QuickSquashedGaussian(distribution.action_dim, distribution.epsilon)

@@ -28,7 +28,7 @@ from sb3_sparse.policies.parts import WHOLE_POLICY, without_graphs
 from sb3_sparse.policies.randomness import peek_seed
 from sb3_sparse.policies.report import SparsityReport, report_on
 from sb3_sparse.policies.spec import NetworkSpec
-from sb3_sparse.policies.storage import may_compact
+from sb3_sparse.policies.storage import may_be_sparse
 from sb3_sparse.policies.vectors import from_vector, to_vector
 
 Sparse = TypeVar("Sparse", bound="SparsePolicyMixin")
@@ -40,7 +40,7 @@ class SparsePolicyMixin(Acts):
     :param observation_space: as in SB3
     :param action_space: as in SB3
     :param lr_schedule: as in SB3
-    :param sparsity: removed fraction of the kernels' connections, in [0, 1), or one for each
+    :param sparsity: removed fraction of the weights, in [0, 1), or one for each
         network, e.g. ``{"actor": 0.95, "critic": 0.8}``; required
     :param initial_sparsity: what training starts with; None: the same; 0.0 for pruning
     :param distribution: ``"erk"``, ``"er"`` or ``"uniform"``
@@ -48,7 +48,7 @@ class SparsePolicyMixin(Acts):
         sparse
     :param dense_layers: layers left dense, by name pattern or the words ``"input"``, ``"output"``
     :param sparsity_aware_init: draw the weights by the fans that are there
-    :param weight_decay: coupled L2 on kernels only
+    :param weight_decay: coupled L2 on weights only
     :param mask_seed: seed of masks and growth; None: read off torch's generator without advancing
         it, so that SB3's ``seed`` decides
     :param compute: ``"masked"``: dense weights and masks; ``"sparse"``: linear layers store and
@@ -117,7 +117,7 @@ class SparsePolicyMixin(Acts):
         for network in networks:
             prefer_fused(network.optimizer)
         layers = [layer for network in networks for layer in network.layers]
-        allowed = may_compact(self, layers, asked_for=compute == "sparse")
+        allowed = may_be_sparse(self, layers, asked_for=compute == "sparse")
         self.sparse = Controller(
             networks,
             seed,
@@ -127,9 +127,9 @@ class SparsePolicyMixin(Acts):
         )
         self.sparse.choose_storage(self)
         if compute == "sparse":
-            self.sparse.compact(self, allowed)
+            self.sparse.to_sparse(self, allowed)
         if not all(layer.full and layer.final_nnz == layer.size for layer in self.sparse.layers):
-            self.quicken()  # a policy without zeros stays stock SB3's to the bit
+            self.use_kernels()  # a policy without zeros stays stock SB3's to the bit
         self.sparse.attach()
 
     def __deepcopy__(self: Sparse, memo: dict[int, Any]) -> Sparse:
@@ -143,13 +143,13 @@ class SparsePolicyMixin(Acts):
 
     def _apply(self, fn: Any, recurse: bool = True) -> Any:
         sparse = vars(self).get("sparse")  # SB3 moves parts before the whole is there
-        if sparse is not None and any(layer.compact for layer in sparse.layers):
+        if sparse is not None and any(layer.is_sparse for layer in sparse.layers):
             try:
                 check_conversion(fn)  # before anything has changed
             except UnsupportedError:
                 if self.sparsity_config.compute != "auto":
                     raise
-                sparse.expand(self)  # to a GPU, say
+                sparse.to_masked(self)  # to a GPU, say
         return super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -167,7 +167,7 @@ class SparsePolicyMixin(Acts):
         finally:
             self.features_extractor_kwargs = given
 
-    def quicken(self) -> None:
+    def use_kernels(self) -> None:
         """Replace what SB3 computes in more steps than it needs."""
 
     def _initial_gain(self, layer_name: str) -> float:
@@ -198,7 +198,7 @@ class SparsePolicyMixin(Acts):
         return same
 
     def parameters_to_vector(self) -> np.ndarray[Any, Any]:
-        """As in SB3; kernels are dense in every storage, 0 where inactive."""
+        """As in SB3; weights are dense in every storage, 0 where inactive."""
         return to_vector(self)
 
     def load_from_vector(self, vector: np.ndarray[Any, Any]) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 from stable_baselines3.common.policies import BaseModel
 from torch import nn
 
-from sb3_sparse.engine.watch import Watch
+from sb3_sparse.engine.changes import ChangeDetector
 from sb3_sparse.policies.storage import KNOWN
 
 SetMode = Callable[[bool], None]
@@ -25,7 +25,7 @@ class Modes:
     """
 
     def __init__(self) -> None:
-        self._watch: Watch | None = None
+        self._changes: ChangeDetector | None = None
         self._switched: list[dict[str, Any]] = []
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Modes:
@@ -41,7 +41,7 @@ class Modes:
         :param set_mode: SB3's way, which walks
         :param mode: True for training
         """
-        if self._watch is not None and self._watch.unchanged():
+        if self._changes is not None and self._changes.unchanged():
             for attributes in self._switched:
                 attributes["training"] = mode
             return True
@@ -51,10 +51,10 @@ class Modes:
     @property
     def off(self) -> bool:
         """Whether what it last switched is in evaluation mode."""
-        return self._watch is not None and not any(map(TRAINING, self._switched))
+        return self._changes is not None and not any(map(TRAINING, self._switched))
 
     def _learn(self, root: nn.Module, set_mode: SetMode, mode: bool) -> None:
-        self._watch = None
+        self._changes = None
         modules = list(root.modules())
         if any(_has_own_way(module) for module in modules):
             set_mode(mode)
@@ -67,7 +67,7 @@ class Modes:
             for module, was in zip(modules, before, strict=True)
             if module.training is not was
         ]
-        self._watch = Watch(modules, tensors=False)
+        self._changes = ChangeDetector(modules, tensors=False)
 
 
 def _has_own_way(module: nn.Module) -> bool:

@@ -12,7 +12,7 @@ from stable_baselines3.common.distributions import Distribution
 from torch import nn
 
 from sb3_sparse.engine.foreign import Guard
-from sb3_sparse.engine.masked import MaskedLayer
+from sb3_sparse.engine.masked import MaskedStorage
 from sb3_sparse.engine.plain import make_plain
 from sb3_sparse.policies.acting import Actions, Acts
 from sb3_sparse.policies.compiled import unwrapped
@@ -33,7 +33,7 @@ class SparsePart(SwitchesModes):
         memo[id(self)] = twin
         twin.__dict__.update(copy.deepcopy(self.__dict__, memo))
         if WHOLE_POLICY not in memo:  # whose controller looks after its parts
-            vars(twin)["guard"] = Guard(MaskedLayer.below(twin))
+            vars(twin)["guard"] = Guard(MaskedStorage.below(twin))
         return twin
 
     def __getstate__(self) -> dict[str, Any]:
@@ -53,7 +53,7 @@ class SparsePart(SwitchesModes):
         th.save({"state_dict": twin.state_dict(), "data": data}, path)
 
     def parameters_to_vector(self) -> np.ndarray[Any, Any]:
-        """As in SB3; kernels are dense in every storage, 0 where inactive."""
+        """As in SB3; weights are dense in every storage, 0 where inactive."""
         return to_vector(self)
 
     def load_from_vector(self, vector: np.ndarray[Any, Any]) -> None:
@@ -76,7 +76,7 @@ class ActingPart(SparsePart, Acts):
         super().__init__(*args, **kwargs)
         self._shortcut: Shortcut | None = None
 
-    def quicken(self) -> None:
+    def use_kernels(self) -> None:
         """Act by the kernels from now on, where they know how."""
         self._shortcut = Shortcut(self.paths, self.on_the_way)
 
@@ -90,7 +90,7 @@ class ActingPart(SparsePart, Acts):
         """As in SB3."""
         self._switch(mode)
         if not mode:  # before anybody acts with what others have written
-            for layer in MaskedLayer.below(self):
+            for layer in MaskedStorage.below(self):
                 layer.notice()
 
     def _choose(self, observations: Actions, deterministic: bool) -> Actions | None:
@@ -113,10 +113,10 @@ class ActsByPart(Acts):
     acting: ClassVar[str]
     """Name of the part."""
 
-    def quicken(self) -> None:
+    def use_kernels(self) -> None:
         part = unwrapped(self.get_submodule(self.acting))
         assert isinstance(part, ActingPart)
-        part.quicken()
+        part.use_kernels()
 
     def _choose(self, observations: Actions, deterministic: bool) -> Actions | None:
         part = self._modules[self.acting]

@@ -15,26 +15,26 @@ from stable_baselines3.common.preprocessing import preprocess_obs
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
-from sb3_sparse.engine.kernels import Kernel
 from sb3_sparse.engine.network import SparseNetwork
+from sb3_sparse.engine.prunable import Prunable
 from sb3_sparse.policies.spec import NetworkSpec
 
-NON_ZEROS = "non-zeros"
+SPARSE = "sparse"
 MASKED = "masked"
 DENSE = "dense"
-COMPUTES = (NON_ZEROS, MASKED, DENSE)
+COMPUTES = (SPARSE, MASKED, DENSE)
 """How a layer may compute."""
 
 
-def compute_of(compact: bool, nnz: int, size: int) -> str:
-    """How a layer computes: :data:`NON_ZEROS`, :data:`MASKED` or :data:`DENSE`.
+def compute_of(is_sparse: bool, nnz: int, size: int) -> str:
+    """How a layer computes: :data:`SPARSE`, :data:`MASKED` or :data:`DENSE`.
 
-    :param compact: whether it stores its active connections only
+    :param is_sparse: whether it stores its active connections only
     :param nnz: active connections
     :param size: connections of the dense layer
     """
-    if compact:
-        return NON_ZEROS
+    if is_sparse:
+        return SPARSE
     return MASKED if nnz < size else DENSE
 
 
@@ -50,7 +50,7 @@ class LayerReport:
     :param flops: of one forward pass at batch 1: multiply-adds count 2, biases and activations 1
     :param dense_flops: the same for the dense layer; 0: not known, and neither are ``flops``
     :param in_budget: False for a layer left dense by ``dense_layers``
-    :param compute: how it computes: ``"non-zeros"``: with its active connections only;
+    :param compute: how it computes: ``"sparse"``: with its active connections only;
         ``"masked"``: with a dense weight that is 0 where inactive; ``"dense"``: all are active
     """
 
@@ -82,7 +82,7 @@ class SparsityReport:
     layers: tuple[LayerReport, ...]
 
     def sparsity(self, network: str | None = None) -> float:
-        """Removed fraction of the kernels within the budget, of one network or of all."""
+        """Removed fraction of the weights within the budget, of one network or of all."""
         layers = [r for r in self.layers if r.in_budget and network in (None, r.network)]
         size = sum(r.size for r in layers)
         return 1.0 - sum(r.nnz for r in layers) / size if size else 0.0
@@ -150,15 +150,15 @@ def report_on(policy: BasePolicy, networks: Iterable[SparseNetwork]) -> Sparsity
     layers = []
     counted: set[int] = set()
     for network in networks:
-        compact = {layer.name for layer in network.layers if layer.compact}
-        kernels: list[tuple[str, Kernel, tuple[int, ...], int, bool]] = [
+        sparse = {layer.name for layer in network.layers if layer.is_sparse}
+        prunable: list[tuple[str, Prunable, tuple[int, ...], int, bool]] = [
             (layer.name, layer.module, layer.shape, layer.nnz, True) for layer in network.layers
         ]
-        kernels += [
+        prunable += [
             (name, module, tuple(module.weight.shape), module.weight.numel(), False)
-            for name, module in network.dense_kernels
+            for name, module in network.dense_layers
         ]
-        for name, module, shape, nnz, in_budget in kernels:
+        for name, module, shape, nnz, in_budget in prunable:
             counted.add(id(module.weight))
             biases = 0 if module.bias is None else module.bias.numel()
             units = shape[0] if id(module) in activated else 0
@@ -173,7 +173,7 @@ def report_on(policy: BasePolicy, networks: Iterable[SparseNetwork]) -> Sparsity
                     flops=places * (2 * nnz + biases + units),
                     dense_flops=places * (2 * math.prod(shape) + biases + units),
                     in_budget=in_budget,
-                    compute=compute_of(name in compact, nnz, math.prod(shape)),
+                    compute=compute_of(name in sparse, nnz, math.prod(shape)),
                 )
             )
     return SparsityReport((*layers, *_other_matrices(policy, counted)))

@@ -16,7 +16,7 @@ from torch import nn
 
 from sb3_sparse.engine.inference import MOST_INPUTS, Inference, by_modules
 from sb3_sparse.engine.kept import KeptInference
-from sb3_sparse.engine.masked import MaskedLayer
+from sb3_sparse.engine.masked import MaskedStorage
 from sb3_sparse.engine.paths import Paths
 from sb3_sparse.policies.storage import KNOWN
 
@@ -53,7 +53,7 @@ class Shortcut:
 
     def _find(self, root: BaseModel) -> tuple[Paths, list[nn.Module]]:
         # Whoever counted on the kernels goes by the modules if they know them no more.
-        for layer in MaskedLayer.below(root):
+        for layer in MaskedStorage.below(root):
             layer.remask()
         if not untouched(root, self._on_the_way):
             return [], [root]

@@ -9,7 +9,7 @@ from fnmatch import fnmatchcase
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
-from sb3_sparse.engine.kernels import Kernel
+from sb3_sparse.engine.prunable import Prunable
 
 DENSE_WORDS = ("input", "output")
 
@@ -34,11 +34,11 @@ class NetworkSpec:
 
 
 @dataclass
-class NetworkKernels:
+class NetworkLayers:
     """The layers found for one network: within the budget, and left dense."""
 
-    sparse: list[tuple[str, Kernel]] = field(default_factory=list)
-    dense: list[tuple[str, Kernel]] = field(default_factory=list)
+    sparse: list[tuple[str, Prunable]] = field(default_factory=list)
+    dense: list[tuple[str, Prunable]] = field(default_factory=list)
 
 
 def _by_module(names: Sequence[str], patterns: Sequence[str]) -> Iterator[list[str]]:

@@ -11,7 +11,7 @@ from collections.abc import Iterable
 
 from torch import nn
 
-from sb3_sparse.engine.layers import SparseLayer
+from sb3_sparse.engine.storage import LayerStorage
 
 CONTAINERS = (nn.Sequential, nn.ModuleList, nn.ModuleDict)
 """Modules of torch that do nothing with the layers in them but call them."""
@@ -19,12 +19,12 @@ KNOWN = {"stable_baselines3", "sb3_contrib", "sb3_sparse"}
 """Packages whose modules do nothing with the layers in them but call them."""
 
 
-def may_compact(policy: nn.Module, layers: Iterable[SparseLayer], asked_for: bool) -> set[str]:
+def may_be_sparse(policy: nn.Module, layers: Iterable[LayerStorage], asked_for: bool) -> set[str]:
     """Names of the layers that nobody is known to read otherwise than by calling them.
 
     :param policy: the policy that the layers belong to
     :param layers: its sparse layers
-    :param asked_for: whether the user asked for compact layers: then modules of the user's own are
+    :param asked_for: whether the user asked for sparse storage: then modules of the user's own are
         taken to call their layers; otherwise nothing is known of them
     """
     uses = Counter(

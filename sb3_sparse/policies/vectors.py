@@ -9,13 +9,13 @@ import torch as th
 from numpy.typing import NDArray
 from torch import nn
 
-from sb3_sparse.engine.linear import CompactLinear
-from sb3_sparse.engine.masked import MaskedLayer
+from sb3_sparse.engine.linear import SparseLinear
+from sb3_sparse.engine.masked import MaskedStorage
 from sb3_sparse.errors import ConfigError, warn
 
 
 def to_vector(root: nn.Module) -> NDArray[np.float32]:
-    """Every parameter in the order of ``root.parameters()``, kernels dense and 0 where inactive.
+    """Every parameter in the order of ``root.parameters()``, weights dense and 0 where inactive.
 
     :param root: a policy, or an actor or critic of one
     :return: shape ``(n,)``, ``n`` the number of parameters of the dense network
@@ -24,9 +24,9 @@ def to_vector(root: nn.Module) -> NDArray[np.float32]:
     parts = []
     for parameter in root.parameters():
         layer = layers.get(id(parameter))
-        if isinstance(layer, MaskedLayer):
+        if isinstance(layer, MaskedStorage):
             layer.remask()
-        dense = layer.dense() if isinstance(layer, CompactLinear) else parameter.detach()
+        dense = layer.dense() if isinstance(layer, SparseLinear) else parameter.detach()
         parts.append(dense.reshape(-1).cpu().numpy())
     return np.concatenate(parts)
 
@@ -57,7 +57,7 @@ def from_vector(root: nn.Module, vector: NDArray[Any]) -> None:
             with th.no_grad():
                 parameter.copy_(part.view_as(parameter))
             continue
-        if isinstance(layer, CompactLinear):
+        if isinstance(layer, SparseLinear):
             layer.take_saved(part.clone())
             kept = layer.dense()
         else:
@@ -71,18 +71,18 @@ def from_vector(root: nn.Module, vector: NDArray[Any]) -> None:
         )
 
 
-def _layers(root: nn.Module) -> dict[int, CompactLinear | MaskedLayer]:
+def _layers(root: nn.Module) -> dict[int, SparseLinear | MaskedStorage]:
     """The sparse layer that each weight belongs to, by the weight's id."""
-    found: dict[int, CompactLinear | MaskedLayer] = {}
+    found: dict[int, SparseLinear | MaskedStorage] = {}
     for module in root.modules():
-        if isinstance(module, CompactLinear):
+        if isinstance(module, SparseLinear):
             found[id(module.weight)] = module
-        elif (layer := MaskedLayer.of(module)) is not None:
+        elif (layer := MaskedStorage.of(module)) is not None:
             found[id(layer.weight)] = layer
     return found
 
 
-def _size(parameter: nn.Parameter, layer: CompactLinear | MaskedLayer | None) -> int:
-    if isinstance(layer, CompactLinear):
+def _size(parameter: nn.Parameter, layer: SparseLinear | MaskedStorage | None) -> int:
+    if isinstance(layer, SparseLinear):
         return layer.in_features * layer.out_features
     return parameter.numel()

@@ -1,14 +1,14 @@
 """How a mask may move: one file a method, one registration each."""
 
 from sb3_sparse.topology import prune, rigl, set, static  # noqa: A004, F401  (they register)
-from sb3_sparse.topology.base import DropGrow, Exchange, Layer, Moment, TopologyMethod
+from sb3_sparse.topology.base import DropGrow, Exchange, Layer, MaskUpdate, TopologyMethod
 from sb3_sparse.topology.registry import method_named, method_names, register
 
 __all__ = [
     "DropGrow",
     "Exchange",
     "Layer",
-    "Moment",
+    "MaskUpdate",
     "TopologyMethod",
     "method_named",
     "method_names",

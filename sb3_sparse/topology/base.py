@@ -51,7 +51,7 @@ class Layer(Protocol):
 
 
 @dataclass(frozen=True)
-class Moment:
+class MaskUpdate:
     """When an update happens and how far it may go.
 
     :param step: gradient step of the optimizer that owns the network, from 1
@@ -104,11 +104,11 @@ class TopologyMethod(ABC):
     """Whether the method takes a denser start to the requested sparsity."""
 
     @abstractmethod
-    def exchange(self, layer: Layer, moment: Moment, *, dense_grad: Array | None) -> Exchange:
+    def exchange(self, layer: Layer, update: MaskUpdate, *, dense_grad: Array | None) -> Exchange:
         """Decide which connections of one layer move at one update.
 
         :param layer: the layer, read only
-        :param moment: when, and how much
+        :param update: when, and how much
         :param dense_grad: gradient of the loss by every weight, active or not, shape ``(size,)``;
             None unless :attr:`needs_gradient`
         """
@@ -126,7 +126,7 @@ class DropGrow(TopologyMethod):
 
     @abstractmethod
     def scores(
-        self, layer: Layer, moment: Moment, candidates: Indices, *, dense_grad: Array | None
+        self, layer: Layer, update: MaskUpdate, candidates: Indices, *, dense_grad: Array | None
     ) -> Array:
         """Score of each candidate; the largest are grown.
 
@@ -134,8 +134,8 @@ class DropGrow(TopologyMethod):
         :return: shape ``(len(candidates),)``
         """
 
-    def exchange(self, layer: Layer, moment: Moment, *, dense_grad: Array | None) -> Exchange:
-        fraction = cosine_drop_fraction(moment.progress, moment.drop_fraction, moment.end)
+    def exchange(self, layer: Layer, update: MaskUpdate, *, dense_grad: Array | None) -> Exchange:
+        fraction = cosine_drop_fraction(update.progress, update.drop_fraction, update.end)
         count = floor_count(fraction * layer.nnz)
         if count == 0 or layer.nnz == layer.size:
             return NOTHING
@@ -143,7 +143,7 @@ class DropGrow(TopologyMethod):
         dropped = least_magnitude(layer.dense(), np.flatnonzero(mask), count)
         mask[dropped] = False
         candidates = np.flatnonzero(~mask)
-        scores = self.scores(layer, moment, candidates, dense_grad=dense_grad)
+        scores = self.scores(layer, update, candidates, dense_grad=dense_grad)
         grown = candidates[largest(scores, count)]
         return Exchange(
             dropped=np.setdiff1d(dropped, grown, assume_unique=True),

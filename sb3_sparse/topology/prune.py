@@ -6,7 +6,7 @@ import numpy as np
 
 from sb3_sparse.sparsity.schedules import pruned_count
 from sb3_sparse.sparsity.selection import least_magnitude
-from sb3_sparse.topology.base import NOTHING, Array, Exchange, Layer, Moment, TopologyMethod
+from sb3_sparse.topology.base import NOTHING, Array, Exchange, Layer, MaskUpdate, TopologyMethod
 from sb3_sparse.topology.registry import register
 
 
@@ -22,14 +22,14 @@ class Prune(TopologyMethod):
     default_begin = 0.2
     reaches_final = True
 
-    def exchange(self, layer: Layer, moment: Moment, *, dense_grad: Array | None) -> Exchange:
+    def exchange(self, layer: Layer, update: MaskUpdate, *, dense_grad: Array | None) -> Exchange:
         keep = pruned_count(
             layer.size,
             layer.initial_nnz,
             layer.final_nnz,
-            moment.progress,
-            moment.begin,
-            moment.end,
+            update.progress,
+            update.begin,
+            update.end,
         )
         surplus = layer.nnz - keep
         if surplus <= 0:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from sb3_sparse.sparsity.selection import Indices
-from sb3_sparse.topology.base import Array, DropGrow, Layer, Moment
+from sb3_sparse.topology.base import Array, DropGrow, Layer, MaskUpdate
 from sb3_sparse.topology.registry import register
 
 
@@ -20,7 +20,7 @@ class RigL(DropGrow):
     needs_gradient = True
 
     def scores(
-        self, layer: Layer, moment: Moment, candidates: Indices, *, dense_grad: Array | None
+        self, layer: Layer, update: MaskUpdate, candidates: Indices, *, dense_grad: Array | None
     ) -> Array:
         assert dense_grad is not None
         return np.abs(dense_grad[candidates])

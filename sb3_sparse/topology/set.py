@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from sb3_sparse.sparsity.randomness import random_bits
 from sb3_sparse.sparsity.selection import Indices
-from sb3_sparse.topology.base import Array, DropGrow, Layer, Moment
+from sb3_sparse.topology.base import Array, DropGrow, Layer, MaskUpdate
 from sb3_sparse.topology.registry import register
 
 
@@ -18,6 +18,6 @@ class SET(DropGrow):
     name = "set"
 
     def scores(
-        self, layer: Layer, moment: Moment, candidates: Indices, *, dense_grad: Array | None
+        self, layer: Layer, update: MaskUpdate, candidates: Indices, *, dense_grad: Array | None
     ) -> Array:
-        return random_bits(moment.seed, f"{layer.name}/grow", candidates.size, moment.step)
+        return random_bits(update.seed, f"{layer.name}/grow", candidates.size, update.step)

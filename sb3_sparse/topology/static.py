@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sb3_sparse.topology.base import NOTHING, Array, Exchange, Layer, Moment, TopologyMethod
+from sb3_sparse.topology.base import NOTHING, Array, Exchange, Layer, MaskUpdate, TopologyMethod
 from sb3_sparse.topology.registry import register
 
 
@@ -13,5 +13,5 @@ class Static(TopologyMethod):
     name = "static"
     options = frozenset()
 
-    def exchange(self, layer: Layer, moment: Moment, *, dense_grad: Array | None) -> Exchange:
+    def exchange(self, layer: Layer, update: MaskUpdate, *, dense_grad: Array | None) -> Exchange:
         return NOTHING

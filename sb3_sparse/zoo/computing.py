@@ -20,11 +20,13 @@ from sb3_sparse.errors import CorruptStateError
 from sb3_sparse.loading.guard import reading
 from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.policies.mixin import SparsePolicyMixin
-from sb3_sparse.policies.report import COMPUTES, NON_ZEROS
+from sb3_sparse.policies.report import COMPUTES, SPARSE
 from sb3_sparse.zoo.record import CURE, NAME, WHAT
 
 FUSED, OWN = "fused", "SB3's own"
 """Ways in which gradient steps run."""
+FORMER = {"non-zeros": SPARSE}
+"""Words of older records for how a layer computes, and today's."""
 
 
 @dataclass(frozen=True)
@@ -47,12 +49,12 @@ class Sitting:
     gradient_steps: str = OWN  # as in records that say nothing of it
 
     def __str__(self) -> str:
-        compact = sum(how == NON_ZEROS for how in self.layers.values())
+        sparse = sum(how == SPARSE for how in self.layers.values())
         kernels = "no kernels" if self.instructions is None else f"{self.instructions} kernels"
         threads = "1 thread" if self.threads == 1 else f"{self.threads} threads"
         return (
-            f"from step {self.num_timesteps}: {compact} of {len(self.layers)} layers on non-zeros, "
-            f"{kernels}, torch's {self.torch_instructions}, {threads}, gradient steps "
+            f"from step {self.num_timesteps}: {sparse} of {len(self.layers)} layers in sparse "
+            f"storage, {kernels}, torch's {self.torch_instructions}, {threads}, gradient steps "
             f"{self.gradient_steps}"
         )
 
@@ -113,9 +115,10 @@ def computing_in(record: Mapping[str, Any], folder: Path) -> Computing | None:
         return None
     with reading(folder / NAME, WHAT, CURE):
         found = record["computing"]
-        sittings = tuple(Sitting(**one) for one in found["sittings"])
+        sittings = tuple(
+            Sitting(**{**one, "layers": _read(one["layers"])}) for one in found["sittings"]
+        )
         for one in sittings:
-            _check(one.layers)
             if type(one.num_timesteps) is not int:
                 raise CorruptStateError(f"a sitting began at step {one.num_timesteps!r}")
             if not isinstance(one.gradient_steps, str):
@@ -132,14 +135,19 @@ def layers_in(record: Mapping[str, Any], folder: Path) -> dict[tuple[str, int], 
     """
     with reading(folder / NAME, WHAT, CURE):
         layers = [one for one in record.get("layers", []) if "compute" in one]
-        found = {(str(one["name"]), int(one["nnz"])): one["compute"] for one in layers}
-        _check({name: how for (name, _), how in found.items()})
-    return found
+        how = _read({str(one["name"]): one["compute"] for one in layers})
+        return {(str(one["name"]), int(one["nnz"])): how[str(one["name"])] for one in layers}
 
 
-def _check(layers: Mapping[str, Any]) -> None:
-    for name, how in layers.items():
+def _read(layers: Mapping[str, Any]) -> dict[str, str]:
+    """How each layer computes, in today's words.
+
+    :raises CorruptStateError: if a record has a word that it cannot have
+    """
+    found = {name: FORMER.get(how, how) for name, how in layers.items()}
+    for name, how in found.items():
         if how not in COMPUTES:
             raise CorruptStateError(
                 f"{name} computes {how!r}, which is none of {', '.join(COMPUTES)}; {CURE}"
             )
+    return found

@@ -9,7 +9,7 @@ from typing import Any
 
 from sb3_sparse.engine.auto import choose
 from sb3_sparse.loading.zips import check_state, look_into
-from sb3_sparse.policies.report import NON_ZEROS, SparsityReport
+from sb3_sparse.policies.report import SPARSE, SparsityReport
 from sb3_sparse.policies.storage import KNOWN
 from sb3_sparse.zoo.computing import Computing, computing_in, layers_in
 from sb3_sparse.zoo.folder import arguments_of, is_run, model_in, zip_path
@@ -39,12 +39,12 @@ class Inspection:
         if self.computing is not None:
             sittings = [f"Trained {sitting}." for sitting in self.computing.sittings]
             return [f"The run asked for compute={self.computing.asked!r}.", *sittings]
-        compact = sum(layer.compute == NON_ZEROS for layer in self.report.layers)
+        sparse = sum(layer.compute == SPARSE for layer in self.report.layers)
         if self.compute != "auto":
             return [f"The model was made with compute={self.compute!r}."]
-        if compact:
+        if sparse:
             of = len(self.report.layers)
-            return [f"compute='auto': {compact} of {of} layers compute on non-zeros here"]
+            return [f"compute='auto': {sparse} of {of} layers in sparse storage here"]
         return ["compute='auto' keeps masks: no linear layer is large and sparse enough"]
 
 
@@ -75,19 +75,19 @@ def inspect_model(path: Path) -> Inspection:
     kwargs = contents.data.get("policy_kwargs")
     kwargs = kwargs if isinstance(kwargs, dict) else {}
     compute = str(kwargs.get("compute", "auto"))
-    compact = _compact(compute, outline, contents.data.get("policy_class"), kwargs)
+    sparse = _sparse(compute, outline, contents.data.get("policy_class"), kwargs)
     layers = (
-        replace(layer, compute=NON_ZEROS) if layer.name in compact else layer
+        replace(layer, compute=SPARSE) if layer.name in sparse else layer
         for layer in outline.report.layers
     )
     told = (replace(one, compute=recorded.get((one.name, one.nnz), one.compute)) for one in layers)
     return Inspection(SparsityReport(tuple(told)), compute, computing)
 
 
-def _compact(
+def _sparse(
     compute: str, outline: Outline, policy_class: object, kwargs: Mapping[str, Any]
 ) -> set[str]:
-    """Names of the layers that compute on their non-zeros when the model is loaded.
+    """Names of the layers in sparse storage when the model is loaded.
 
     :param policy_class: what the file says of it
     :param kwargs: the policy's arguments

@@ -10,9 +10,9 @@ from typing import Any
 import torch as th
 from torch import nn
 
-from sb3_sparse.engine.kernels import Kernel
-from sb3_sparse.engine.layers import SparseLayer
-from sb3_sparse.engine.masked import MaskedLayer
+from sb3_sparse.engine.masked import MaskedStorage
+from sb3_sparse.engine.prunable import Prunable
+from sb3_sparse.engine.storage import LayerStorage
 from sb3_sparse.errors import ConfigError, CorruptStateError
 from sb3_sparse.policies.aliases import SparsePolicy, supported_algorithms
 from sb3_sparse.policies.compiled import plain_names
@@ -40,7 +40,7 @@ class Outline:
 
     report: SparsityReport
     root: nn.Module
-    layers: list[SparseLayer]
+    layers: list[LayerStorage]
 
 
 def outline_of(state: Mapping[str, Any], image: tuple[int, ...] | None, where: str) -> Outline:
@@ -54,17 +54,17 @@ def outline_of(state: Mapping[str, Any], image: tuple[int, ...] | None, where: s
     """
     state = plain_names(state)
     specs = _specs(state)
-    kernels = _kernels(state, specs)
-    if not any(name + MASK in state for name in kernels):
+    networks = _networks(state, specs)
+    if not any(name + MASK in state for name in networks):
         raise ConfigError(
             f"the policy in {where} is not sparse: none of its layers has a mask. Make a sparse "
             "twin of it with sb3-sparse compress"
         )
     root = nn.Module()
-    layers: list[SparseLayer] = []
+    layers: list[LayerStorage] = []
     reports = []
-    positions = positions_of({name: tuple(state[name + WEIGHT].shape) for name in kernels}, image)
-    for name, network in kernels.items():
+    positions = positions_of({name: tuple(state[name + WEIGHT].shape) for name in networks}, image)
+    for name, network in networks.items():
         weight, mask = state[name + WEIGHT], state.get(name + MASK)
         if weight.numel() == 0:
             raise CorruptStateError(f"{where} is damaged: {name} has shape {tuple(weight.shape)}")
@@ -74,7 +74,7 @@ def outline_of(state: Mapping[str, Any], image: tuple[int, ...] | None, where: s
             raise CorruptStateError(f"{where} is damaged: {error.args[0]}") from error
         nnz = weight.numel()
         if mask is not None:
-            layer = MaskedLayer(name, module)
+            layer = MaskedStorage(name, module)
             layer.set_mask(mask.bool().numpy())
             layers.append(layer)
             nnz = layer.nnz
@@ -95,7 +95,7 @@ def outline_of(state: Mapping[str, Any], image: tuple[int, ...] | None, where: s
             )
         )
     _fill(root)
-    order = {network: place for place, network in enumerate(dict.fromkeys(kernels.values()))}
+    order = {network: place for place, network in enumerate(dict.fromkeys(networks.values()))}
     reports.sort(key=lambda one: (order[one.network], not one.in_budget))
     return Outline(SparsityReport(tuple(reports)), root, layers)
 
@@ -114,7 +114,7 @@ def _below(name: str, roots: tuple[str, ...]) -> bool:
     return any(name.startswith(f"{root}.") for root in roots)
 
 
-def _kernels(state: Mapping[str, Any], specs: Mapping[str, NetworkSpec]) -> dict[str, str]:
+def _networks(state: Mapping[str, Any], specs: Mapping[str, NetworkSpec]) -> dict[str, str]:
     """Names of the layers and of their networks, each weight once, targets left out."""
     targets = tuple(f"{spec.target}." for spec in specs.values() if spec.target is not None)
     names = [
@@ -167,7 +167,7 @@ def _number(key: str, module: str) -> int:
     return int(rest) if rest.isdigit() else -1
 
 
-def _place(root: nn.Module, name: str, weight: th.Tensor, bias: bool) -> Kernel:
+def _place(root: nn.Module, name: str, weight: th.Tensor, bias: bool) -> Prunable:
     """Put a layer of a weight's shape under its dotted name."""
     *path, last = name.split(".")
     for part in path:
@@ -175,7 +175,7 @@ def _place(root: nn.Module, name: str, weight: th.Tensor, bias: bool) -> Kernel:
             root.add_module(part, nn.Module())
         root = root.get_submodule(part)
     outputs, inputs, *size = weight.shape
-    layer: Kernel
+    layer: Prunable
     with th.device("meta"):
         if weight.dim() == 2:
             layer = nn.Linear(inputs, outputs, bias=bias)

@@ -110,9 +110,9 @@ class TrainingProgress(Watch):
         self.printed = 0
         policy = unwrapped(self.model.policy)
         if isinstance(policy, SparsePolicyMixin):
-            compact = [layer.compact for layer in policy.sparse.layers]
-            if any(compact):
-                self.console.print(f"{sum(compact)} of {len(compact)} layers compute on non-zeros")
+            sparse = [layer.is_sparse for layer in policy.sparse.layers]
+            if any(sparse):
+                self.console.print(f"{sum(sparse)} of {len(sparse)} layers in sparse storage")
         self.console.print(f"Gradient steps: {gradient_steps_of(self.model)}", soft_wrap=True)
         self.task = self.progress.add_task("", total=self.planned, status=self._status())
         self.progress.start()

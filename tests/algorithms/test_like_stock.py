@@ -37,11 +37,11 @@ def test_thirty_gradient_steps(name, method, storage):
 
 @pytest.mark.parametrize("method", ["rigl"])
 @pytest.mark.parametrize("name", NAMES)
-def test_layers_that_auto_makes_compact(name, method):
+def test_layers_that_auto_makes_sparse(name, method):
     kwargs = dict(policy_kwargs_of(method, "auto"), sparsity=0.95, net_arch=[160, 80])
     ours, stock = assert_like_stock(name, lambda: moving(method), policy_kwargs=kwargs)
     assert_networks_alike(ours, stock)
-    assert any(layer.compact for layer in ours.policy.sparse.layers)
+    assert any(layer.is_sparse for layer in ours.policy.sparse.layers)
 
 
 @pytest.mark.parametrize("method", ["set", "rigl", "prune"])

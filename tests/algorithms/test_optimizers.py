@@ -53,7 +53,7 @@ def test_a_kind_of_optimizer(name, kind, settings):
 
 
 @pytest.mark.parametrize(("kind", "settings"), KINDS[4:6])
-def test_compact_layers(kind, settings):
+def test_sparse_layers(kind, settings):
     kwargs = dict(optimizer_class=kind, optimizer_kwargs=dict(settings), compute="sparse")
     assert_like_stock("SAC", lambda: moving("rigl"), policy_kwargs=kwargs)
 

@@ -76,7 +76,7 @@ def test_many_observations_are_run_in_parts():
 
 
 @pytest.mark.parametrize("compute", ["masked", "sparse"])
-def test_compact_networks_show_what_masked_ones_do(compute):
+def test_sparse_networks_show_what_masked_ones_do(compute):
     model = make("SAC", policy_kwargs={"compute": compute})
     observations = np.linspace(-1, 1, 60, dtype=np.float32).reshape(20, 3)
     (features,) = activity(model, observations)["actor"].features

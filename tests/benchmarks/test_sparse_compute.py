@@ -1,4 +1,4 @@
-"""The benchmark of computing on non-zeros: what it says of the rule of ``compute="auto"``."""
+"""The benchmark of sparse storage: what it says of the rule of ``compute="auto"``."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ def row(variant: str, speedup: float, sparsity: float = 0.5) -> dict[str, object
 
 
 def test_the_rule_is_behind_the_better_of_its_two_choices(sparse_compute, capsys):
-    half = [row("masked", 1.0), row("non-zeros avx2", 1.5), row("auto avx2", 1.0)]
-    near = [row("masked", 1.0, 0.9), row("non-zeros avx2", 2.0, 0.9), row("auto avx2", 1.95, 0.9)]
-    slow = [row("masked", 1.0, 0.8), row("non-zeros avx2", 0.5, 0.8), row("auto avx2", 0.8, 0.8)]
+    half = [row("masked", 1.0), row("sparse avx2", 1.5), row("auto avx2", 1.0)]
+    near = [row("masked", 1.0, 0.9), row("sparse avx2", 2.0, 0.9), row("auto avx2", 1.95, 0.9)]
+    slow = [row("masked", 1.0, 0.8), row("sparse avx2", 0.5, 0.8), row("auto avx2", 0.8, 0.8)]
     sparse_compute.print_rule([*half, *near, *slow, dict(half[1], what="step")])
     assert capsys.readouterr().out.splitlines() == [
         "2 of 3 cases in which auto is more than 5% behind",
-        "  DQN 256 ReLU 50% avx2: auto 1.00x, non-zeros 1.50x of masked: 50.0% behind",
-        "  DQN 256 ReLU 80% avx2: auto 0.80x, non-zeros 0.50x of masked: 25.0% behind",
+        "  DQN 256 ReLU 50% avx2: auto 1.00x, sparse 1.50x of masked: 50.0% behind",
+        "  DQN 256 ReLU 80% avx2: auto 0.80x, sparse 0.50x of masked: 25.0% behind",
     ]
 
 
@@ -49,7 +49,7 @@ def test_the_rule_is_measured_in_every_instruction_set(sparse_compute, monkeypat
     with path.open(newline="") as file:
         rows = {one["variant"]: one for one in csv.DictReader(file)}
     sets = instruction_sets()
-    named = [f"{name} {one}" for name in ("non-zeros", "auto") for one in sets]
+    named = [f"{name} {one}" for name in ("sparse", "auto") for one in sets]
     assert list(rows) == ["masked", *named]
     assert {one["case"] for one in rows.values()} == {"DQN 16 Tanh"}
     for one in sets:  # so small that auto keeps masks, and so is the same program

@@ -192,7 +192,7 @@ def test_networks_have_sparsities_of_their_own_in_every_storage(compute):
     actor = sparse.networks[0]
     # 3-24-24: 72 and 576 connections, of which 0.9 * 72 = 64.8 and 518.4 go, rounded down
     assert [layer.nnz for layer in actor.layers] == [8, 58]
-    assert [layer.compact for layer in actor.layers] == [compute == "sparse"] * 2
+    assert [layer.is_sparse for layer in actor.layers] == [compute == "sparse"] * 2
     further = sparsify(twin, {"actor": 0.95, "critic": 0.0})
     config = further.policy.sparsity_config
     assert (config.distribution, config.compute) == ("uniform", compute)

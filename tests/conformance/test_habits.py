@@ -176,7 +176,7 @@ def test_optimizers_that_need_matrices_keep_masks(name):
     kwargs = dict(optimizer_class=th.optim.Adafactor, compute="auto")
     model = make(name, policy_kwargs=kwargs)
     model.learn(60, callback=SparsityCallback("rigl", update_interval=4))
-    assert not any(layer.compact for layer in model.policy.sparse.layers)
+    assert not any(layer.is_sparse for layer in model.policy.sparse.layers)
     assert inactive(model) == 0.0
     with pytest.raises(UnsupportedError, match="Adafactor"):
         make(name, policy_kwargs=dict(kwargs, compute="sparse"))
@@ -474,7 +474,7 @@ def test_parameters_that_join_an_optimizer_of_the_users_own_are_followed():
 
 
 @pytest.mark.parametrize("name", ["SAC", "PPO"])
-def test_lbfgs_is_refused_once_compact_masks_have_moved(name, storage):
+def test_lbfgs_is_refused_once_sparse_masks_have_moved(name, storage):
     model = make(name)
     own = th.optim.LBFGS(model.policy.parameters(), lr=1e-3, max_iter=1)
     parameters = list(model.policy.parameters())

@@ -43,12 +43,12 @@ def trained(name: str, method: str, compute: str):
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_the_same_moves_connection_for_connection_and_the_same_weights(name, method):
-    masked, compact = (trained(name, method, compute) for compute in ("masked", "sparse"))
-    assert all(layer.compact for layer in compact.policy.sparse.layers)
-    ours, theirs = compact.policy.state_dict(), masked.policy.state_dict()
+    masked, sparse = (trained(name, method, compute) for compute in ("masked", "sparse"))
+    assert all(layer.is_sparse for layer in sparse.policy.sparse.layers)
+    ours, theirs = sparse.policy.state_dict(), masked.policy.state_dict()
     assert list(ours) == list(theirs)
     if method != "static":
-        assert max(n.mask_updates for n in compact.policy.sparse.networks) > 0
+        assert max(n.mask_updates for n in sparse.policy.sparse.networks) > 0
     # A bias before a BatchRenorm has gradient 0 but for rounding, which Adam makes a whole step of.
     loose = name == "CrossQ"
     for key, value in theirs.items():
@@ -59,7 +59,7 @@ def test_the_same_moves_connection_for_connection_and_the_same_weights(name, met
     if loose:
         return
     for one, other in zip(
-        masked.policy.sparse.optimizers, compact.policy.sparse.optimizers, strict=True
+        masked.policy.sparse.optimizers, sparse.policy.sparse.optimizers, strict=True
     ):
         ones, others = one.state_dict()["state"], other.state_dict()["state"]
         assert list(ones) == list(others)
@@ -80,7 +80,7 @@ def test_what_one_storage_saved_the_other_resumes(name, saver, tmp_path, monkeyp
         ALGORITHMS[name].load(tmp_path / "model", env=model.get_env(), custom_objects=objects)
         for objects in (None, {"policy_kwargs": kwargs})
     ]
-    assert [all(layer.compact for layer in t.policy.sparse.layers) for t in twins] == [
+    assert [all(layer.is_sparse for layer in t.policy.sparse.layers) for t in twins] == [
         saver == "sparse",
         other == "sparse",
     ]

@@ -12,8 +12,8 @@ from torch import nn
 from torch.nn import functional
 
 from sb3_sparse import SparsityCallback
-from sb3_sparse.engine.auto import choose, runs_of
-from sb3_sparse.engine.masked import MaskedLayer
+from sb3_sparse.engine.auto import chains_of, choose
+from sb3_sparse.engine.masked import MaskedStorage
 from sb3_sparse.engine.native import library
 from sb3_sparse.errors import UnsupportedError
 
@@ -25,11 +25,11 @@ class All:
         return True
 
 
-def layers_of(root: nn.Module, density: float = 0.2) -> list[MaskedLayer]:
+def layers_of(root: nn.Module, density: float = 0.2) -> list[MaskedStorage]:
     layers = []
     for name, module in root.named_modules():
         if isinstance(module, (nn.Linear, nn.Conv2d)):
-            layer = MaskedLayer(name, module)
+            layer = MaskedStorage(name, module)
             layer.set_mask(np.arange(layer.size) < round(density * layer.size))
             layers.append(layer)
     return layers
@@ -43,7 +43,7 @@ def test_runs_are_linear_layers_with_activations_between_them():
         nn.Conv2d(1, 1, 1),
         nn.Linear(6, 7),
     )
-    names = [[layer.name for layer in run] for run in runs_of(root, layers_of(root))]
+    names = [[layer.name for layer in run] for run in chains_of(root, layers_of(root))]
     assert names == [["2"], ["0.0", "0.2"], ["0.4"]]
 
 
@@ -55,7 +55,7 @@ def use():
 
 
 @pytest.mark.parametrize("instructions", library.instruction_sets())
-def test_a_run_computes_on_non_zeros_if_a_layer_in_it_is_large_and_sparse(use, instructions):
+def test_a_chain_is_sparse_if_a_layer_in_it_is_large_and_sparse_enough(use, instructions):
     use(instructions)
     most = 0.5 if instructions in ("avx512", "avx2") else 0.25
     root = nn.Sequential(
@@ -92,13 +92,13 @@ def large(name: str = "SAC", **policy_kwargs):
     return make(name, policy_kwargs=kwargs)
 
 
-def compact_names(model) -> list[str]:
-    return [layer.name for layer in model.policy.sparse.layers if layer.compact]
+def sparse_names(model) -> list[str]:
+    return [layer.name for layer in model.policy.sparse.layers if layer.is_sparse]
 
 
 def test_storage_is_decided_when_the_policy_is_built_and_shapes_stay(tmp_path):
     model = large()
-    names = compact_names(model)
+    names = sparse_names(model)
     assert names == [
         f"{part}.{layer}"
         for part, layers in (("actor.latent_pi", (0, 2)), ("critic.qf0", (0, 2, 4)),
@@ -111,18 +111,18 @@ def test_storage_is_decided_when_the_policy_is_built_and_shapes_stay(tmp_path):
     assert [parameter.shape for parameter in model.policy.parameters()] == shapes
     averaged.update_parameters(model.policy.critic)
     model.save(tmp_path / "model")
-    assert compact_names(SAC.load(tmp_path / "model")) == names
+    assert sparse_names(SAC.load(tmp_path / "model")) == names
 
 
-def test_a_policy_that_is_pruned_becomes_compact_once_it_is_sparse_enough(tmp_path):
+def test_a_pruned_policy_changes_its_storage_once_it_is_sparse_enough(tmp_path):
     model = large(initial_sparsity=0.0)
-    assert compact_names(model) == []
+    assert sparse_names(model) == []
     model.learn(60, callback=SparsityCallback("prune", update_interval=1, begin=0.4, end=0.9))
-    assert "critic.qf1.2" in compact_names(model)
+    assert "critic.qf1.2" in sparse_names(model)
     assert_masked(model)
     model.save(tmp_path / "model")
     loaded = SAC.load(tmp_path / "model")
-    assert compact_names(loaded) == compact_names(model)
+    assert sparse_names(loaded) == sparse_names(model)
     assert_masked(loaded)
     moments = [m.critic.optimizer.state_dict()["state"] for m in (model, loaded)]
     for number, state in moments[0].items():
@@ -137,7 +137,7 @@ def test_a_policy_that_leaves_float32_on_the_cpu_goes_back_to_masks(where):
     model.learn(25, callback=SparsityCallback("set", update_interval=2))
     model.policy.load_state_dict(before)
     model.policy.to(where)
-    assert compact_names(model) == []
+    assert sparse_names(model) == []
     if where == "meta":
         return
     for key, value in model.policy.state_dict().items():
@@ -147,7 +147,7 @@ def test_a_policy_that_leaves_float32_on_the_cpu_goes_back_to_masks(where):
     assert th.equal(model.policy.actor.latent_pi(x), twin.actor.latent_pi(x))
     model.policy.to(th.float32)
     model.learn(30, callback=SparsityCallback("set", update_interval=2))
-    assert compact_names(model) == []
+    assert sparse_names(model) == []
     assert_masked(model)
 
 
@@ -155,7 +155,7 @@ def test_moments_and_targets_survive_the_way_back_to_masks():
     model = large().learn(30, callback=SparsityCallback("set", update_interval=2))
     moments = model.critic.optimizer.state_dict()
     target = {k: v.clone() for k, v in model.critic_target.state_dict().items()}
-    model.policy.sparse.expand(model.policy)
+    model.policy.sparse.to_masked(model.policy)
     for key, value in model.critic_target.state_dict().items():
         assert th.equal(value, target[key])
     for number, state in model.critic.optimizer.state_dict()["state"].items():
@@ -213,14 +213,14 @@ def test_weights_that_are_read_otherwise_than_by_their_layer_stay_matrices(name,
     model = large(name, features_extractor_class=extractor, dense_layers=DENSE.get(extractor, []))
     model.learn(50, callback=SparsityCallback("set", update_interval=4))
     model.predict(model.observation_space.sample())
-    names = compact_names(model)
+    names = sparse_names(model)
     assert names
     assert not any("features_extractor" in name for name in names)
     assert_masked(model)
 
 
 @pytest.mark.parametrize("extractor", [Attentive, Shared])
-def test_sparse_compacts_what_the_user_calls_and_never_what_torch_reads(extractor):
+def test_sparse_stores_what_the_user_calls_and_never_what_torch_reads(extractor):
     model = make(
         "PPO",
         policy_kwargs=dict(
@@ -229,7 +229,7 @@ def test_sparse_compacts_what_the_user_calls_and_never_what_torch_reads(extracto
             dense_layers=DENSE.get(extractor, []),
         ),
     )
-    names = compact_names(model)
+    names = sparse_names(model)
     inner = "embed" if extractor is Attentive else "layers.0"
     assert f"features_extractor.{inner}" in names or f"pi_features_extractor.{inner}" in names
     assert not any("linear1" in name or name.endswith(("layers.2", "layers.3")) for name in names)
@@ -241,4 +241,4 @@ def test_only_the_user_can_undo_sparse():
     model = make("SAC", policy_kwargs=dict(compute="sparse"))
     with pytest.raises(UnsupportedError, match="make the policy with compute='masked'"):
         model.policy.double()
-    assert compact_names(model)
+    assert sparse_names(model)

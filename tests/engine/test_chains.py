@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from torch import nn
 from torch.nn import functional
 
-from sb3_sparse.engine.linear import CompactLinear
+from sb3_sparse.engine.linear import SparseLinear
 from sb3_sparse.engine.native import library
 from sb3_sparse.engine.sequential import ChainedSequential, chain_up
 from sb3_sparse.engine.structure import Structure
@@ -63,10 +63,10 @@ def random_mask(shape, kind: str, random: np.random.Generator) -> np.ndarray:
 
 
 def networks(widths, kinds, activation, bias, seed) -> tuple[nn.Sequential, nn.Sequential]:
-    """The same layers dense under masks, and compact."""
+    """The same layers dense under masks, and sparse."""
     random = np.random.default_rng(seed)
     th.manual_seed(seed)
-    dense, compact = [], []
+    dense, sparse = [], []
     for i, (columns, rows) in enumerate(zip(widths, widths[1:], strict=False)):
         mask = random_mask((rows, columns), kinds[i % len(kinds)], random)
         layer, twin = nn.Linear(columns, rows, bias=bias), nn.Linear(columns, rows, bias=bias)
@@ -75,13 +75,13 @@ def networks(widths, kinds, activation, bias, seed) -> tuple[nn.Sequential, nn.S
         twin.load_state_dict(layer.state_dict())
         layer.mask = mask
         dense += [layer, activation()]
-        compact += [
-            CompactLinear.convert(twin, Structure.of_mask(mask, mask.shape), is_target=False),
+        sparse += [
+            SparseLinear.convert(twin, Structure.of_mask(mask, mask.shape), is_target=False),
             activation(),
         ]
     dense.pop()
-    compact.pop()
-    result = nn.Sequential(*compact)
+    sparse.pop()
+    result = nn.Sequential(*sparse)
     chain_up(result)
     assert type(result) is ChainedSequential
     return nn.Sequential(*dense), result
@@ -94,17 +94,17 @@ def close(ours: th.Tensor, theirs: th.Tensor, usual: float = 1e-2) -> None:
     np.testing.assert_allclose(ours.detach(), theirs.detach(), rtol=0, atol=TOLERANCE * scale)
 
 
-def compare(dense, compact, batch, seed=0) -> None:
+def compare(dense, sparse, batch, seed=0) -> None:
     random = th.Generator().manual_seed(seed)
     x = th.randn(batch, dense[0].in_features, generator=random)
     grad = th.randn(batch, dense[-1].out_features, generator=random)
     ours, theirs = x.clone().requires_grad_(), x.clone().requires_grad_()
-    y = compact(ours)
+    y = sparse(ours)
     close(y, dense(theirs))
     with th.no_grad():
-        close(compact(x), y)
+        close(sparse(x), y)
         for row in range(min(3, batch)):
-            close(compact(x[row : row + 1]), y[row : row + 1])
+            close(sparse(x[row : row + 1]), y[row : row + 1])
     y.backward(grad)
     terms = {}
 
@@ -116,7 +116,7 @@ def compare(dense, compact, batch, seed=0) -> None:
             layer.register_forward_hook(note)
     dense(theirs).backward(grad)
     close(ours.grad, theirs.grad)
-    for layer, twin in zip(dense, compact, strict=True):
+    for layer, twin in zip(dense, sparse, strict=True):
         if isinstance(layer, nn.Linear):
             # A sum of terms of random signs has the size of their root sum of squares.
             squares, slopes = (part.square() for part in terms[layer])
@@ -152,15 +152,15 @@ def test_every_instruction_set_handles_every_batch(instructions, batch, activati
 
 
 def test_results_do_not_depend_on_the_number_of_threads(threads):
-    dense, compact = networks([40, 90, 50], ["some"], nn.ReLU, True, 1)
+    dense, sparse = networks([40, 90, 50], ["some"], nn.ReLU, True, 1)
     x = th.randn(333, 40)
     found = []
     for count in (1, 2, 5):
         threads(count)
-        compact.zero_grad()
-        y = compact(x)
+        sparse.zero_grad()
+        y = sparse(x)
         y.square().sum().backward()
-        found.append([y.detach(), *(p.grad.clone() for p in compact.parameters())])
+        found.append([y.detach(), *(p.grad.clone() for p in sparse.parameters())])
     for several in found[1:]:
         np.testing.assert_array_equal(several[0], found[0][0])
         for ours, one in zip(several[1:], found[0][1:], strict=True):
@@ -170,13 +170,13 @@ def test_results_do_not_depend_on_the_number_of_threads(threads):
 def test_instruction_sets_agree():
     if len(library.instruction_sets()) == 1:
         pytest.skip("this processor has one instruction set only")
-    _, compact = networks([40, 90, 50], ["some"], nn.ReLU, True, 1)
+    _, sparse = networks([40, 90, 50], ["some"], nn.ReLU, True, 1)
     x = th.randn(100, 40)
     best = library.in_use()
     found = []
     for name in library.instruction_sets():
         library.use(name)
-        found.append(compact(x).detach())
+        found.append(sparse(x).detach())
     library.use(best)
     for other in found[1:]:
         close(other, found[0])
@@ -188,24 +188,24 @@ def test_an_unknown_instruction_set_is_refused():
 
 
 def test_leading_dimensions_stay_and_a_single_vector_too():
-    dense, compact = networks([5, 8, 3], ["some"], nn.ReLU, True, 0)
+    dense, sparse = networks([5, 8, 3], ["some"], nn.ReLU, True, 0)
     for shape in [(5,), (7, 5), (2, 3, 5), (0, 5)]:
         x = th.randn(shape)
-        close(compact(x), dense(x))
+        close(sparse(x), dense(x))
 
 
 def test_an_empty_batch_has_gradients_of_zero():
-    _, compact = networks([5, 8, 3], ["some"], nn.Tanh, True, 0)
+    _, sparse = networks([5, 8, 3], ["some"], nn.Tanh, True, 0)
     x = th.zeros(0, 5, requires_grad=True)
-    compact(x).sum().backward()
+    sparse(x).sum().backward()
     assert x.grad.shape == (0, 5)
-    assert not any(parameter.grad.any() for parameter in compact.parameters())
+    assert not any(parameter.grad.any() for parameter in sparse.parameters())
 
 
 def test_a_strided_input_is_taken_as_it_is():
-    dense, compact = networks([5, 8, 3], ["some"], nn.ReLU, True, 0)
+    dense, sparse = networks([5, 8, 3], ["some"], nn.ReLU, True, 0)
     x = th.randn(9, 10)[:, ::2]
-    close(compact(x), dense(x))
+    close(sparse(x), dense(x))
 
 
 @pytest.mark.parametrize(
@@ -214,34 +214,34 @@ def test_a_strided_input_is_taken_as_it_is():
     ids=["wide", "double", "0d"],
 )
 def test_what_the_kernels_cannot_read_is_refused(x):
-    _, compact = networks([5, 8, 3], ["some"], nn.ReLU, True, 0)
+    _, sparse = networks([5, 8, 3], ["some"], nn.ReLU, True, 0)
     with pytest.raises(UnsupportedError, match="takes float32 on the CPU with 5 features"):
-        compact(x)
+        sparse(x)
 
 
 def test_what_is_not_a_number_stays_that():
-    dense, compact = networks([5, 8, 3], ["full"], nn.ReLU, True, 0)
+    dense, sparse = networks([5, 8, 3], ["full"], nn.ReLU, True, 0)
     x = th.zeros(4, 5)
     x[2, 1] = float("nan")
-    assert th.isnan(compact(x)[2]).all()
-    assert not th.isnan(compact(x)[[0, 1, 3]]).any()
+    assert th.isnan(sparse(x)[2]).all()
+    assert not th.isnan(sparse(x)[[0, 1, 3]]).any()
     assert th.isnan(dense(x)[2]).all()
 
 
 def test_weights_without_gradient_get_none_and_pass_it_on():
-    dense, compact = networks([5, 8, 3], ["some"], nn.ReLU, True, 0)
+    dense, sparse = networks([5, 8, 3], ["some"], nn.ReLU, True, 0)
     x = th.randn(7, 5)
     ours, theirs = x.clone().requires_grad_(), x.clone().requires_grad_()
-    for parameter in compact.parameters():
+    for parameter in sparse.parameters():
         parameter.requires_grad_(False)
-    compact(ours).sum().backward()
+    sparse(ours).sum().backward()
     dense(theirs).sum().backward()
     close(ours.grad, theirs.grad)
-    assert all(parameter.grad is None for parameter in compact.parameters())
+    assert all(parameter.grad is None for parameter in sparse.parameters())
 
 
 def test_second_derivatives_as_trpo_takes_them():
-    dense, compact = networks([5, 8, 3], ["some"], nn.Tanh, True, 0)
+    dense, sparse = networks([5, 8, 3], ["some"], nn.Tanh, True, 0)
     x = th.randn(70, 5)
 
     def curvature(network: nn.Module) -> list[th.Tensor]:
@@ -255,39 +255,39 @@ def test_second_derivatives_as_trpo_takes_them():
     flat = [layer for layer in dense if isinstance(layer, nn.Linear)]
     for layer, mask in zip(flat, masks, strict=True):
         layer.weight.register_hook(lambda grad, mask=mask: grad * mask)
-    ours, theirs = curvature(compact), curvature(dense)
+    ours, theirs = curvature(sparse), curvature(dense)
     for i, (mine, other) in enumerate(zip(ours, theirs, strict=True)):
         close(mine, other if i % 2 else other[masks[i // 2]])
 
 
 def test_a_hooked_module_is_called_by_itself():
-    dense, compact = networks([5, 8, 3], ["some"], nn.ReLU, True, 0)
+    dense, sparse = networks([5, 8, 3], ["some"], nn.ReLU, True, 0)
     seen = []
-    handle = compact[1].register_forward_hook(lambda module, inputs, y: seen.append(y))
+    handle = sparse[1].register_forward_hook(lambda module, inputs, y: seen.append(y))
     x = th.randn(7, 5)
-    close(compact(x), dense(x))
+    close(sparse(x), dense(x))
     close(seen[0], functional.relu(dense[0](x)))
     handle.remove()
-    compact(x)
+    sparse(x)
     assert len(seen) == 1
 
 
 def test_a_changed_sequence_is_noticed():
-    dense, compact = networks([5, 8, 3], ["some"], nn.ReLU, True, 0)
+    dense, sparse = networks([5, 8, 3], ["some"], nn.ReLU, True, 0)
     x = th.randn(7, 5)
-    compact(x)
-    compact.append(nn.Tanh())
-    close(compact(x), th.tanh(dense(x)))
-    compact[1] = nn.Sigmoid()
-    close(compact(x), th.tanh(dense[2](th.sigmoid(dense[0](x)))))
+    sparse(x)
+    sparse.append(nn.Tanh())
+    close(sparse(x), th.tanh(dense(x)))
+    sparse[1] = nn.Sigmoid()
+    close(sparse(x), th.tanh(dense[2](th.sigmoid(dense[0](x)))))
 
 
 def test_modules_that_look_at_whole_rows_get_rows():
-    dense, compact = networks([5, 8, 8, 3], ["some"], nn.ReLU, True, 0)
+    dense, sparse = networks([5, 8, 8, 3], ["some"], nn.ReLU, True, 0)
     norm = nn.LayerNorm(8)
     x = th.randn(70, 5)
     close(
-        chained(compact[0], norm, compact[1], compact[2])(x),
+        chained(sparse[0], norm, sparse[1], sparse[2])(x),
         nn.Sequential(dense[0], norm, dense[1], dense[2])(x),
     )
 
@@ -298,29 +298,29 @@ def test_activations_may_work_in_place(activation):
 
 
 def test_a_traced_network_is_the_network():
-    dense, compact = networks([5, 8, 3], ["some"], nn.Tanh, True, 0)
+    dense, sparse = networks([5, 8, 3], ["some"], nn.Tanh, True, 0)
     with th.no_grad():
-        traced = th.jit.trace(compact, th.randn(2, 5))
+        traced = th.jit.trace(sparse, th.randn(2, 5))
     x = th.randn(7, 5)
     close(traced(x), dense(x))
 
 
 def test_who_watches_operations_sees_dense_ones():
-    dense, compact = networks([5, 8, 3], ["some"], nn.Tanh, True, 0)
+    dense, sparse = networks([5, 8, 3], ["some"], nn.Tanh, True, 0)
     x = th.randn(7, 5)
-    close(th.fx.experimental.proxy_tensor.make_fx(compact)(x)(-x), dense(-x))
-    close(th.func.vmap(compact)(x), dense(x))
+    close(th.fx.experimental.proxy_tensor.make_fx(sparse)(x)(-x), dense(-x))
+    close(th.func.vmap(sparse)(x), dense(x))
 
 
 def test_negated_views_are_what_they_say():
-    dense, compact = networks([5, 8, 3], ["some"], nn.Tanh, True, 0)
+    dense, sparse = networks([5, 8, 3], ["some"], nn.Tanh, True, 0)
     x = th.randn(7, 5)
-    close(compact(th._neg_view(x)), dense(-x))
+    close(sparse(th._neg_view(x)), dense(-x))
 
 
-def test_under_autocast_compact_layers_stay_float32():
-    dense, compact = networks([5, 8, 3], ["some"], nn.ReLU, True, 0)
-    mixed = nn.Sequential(dense[0], *list(compact)[1:])
+def test_under_autocast_sparse_layers_stay_float32():
+    dense, sparse = networks([5, 8, 3], ["some"], nn.ReLU, True, 0)
+    mixed = nn.Sequential(dense[0], *list(sparse)[1:])
     x = th.randn(7, 5)
     with th.autocast("cpu", dtype=th.bfloat16):
         y = mixed(x)
@@ -329,66 +329,66 @@ def test_under_autocast_compact_layers_stay_float32():
 
 
 def test_torchs_defaults_change_nothing():
-    dense, compact = networks([5, 8, 3], ["some"], nn.Tanh, True, 0)
+    dense, sparse = networks([5, 8, 3], ["some"], nn.Tanh, True, 0)
     x = th.randn(7, 5)
     expected = dense(x)
     th.set_default_dtype(th.float64)
     try:
         with th.device("meta"):
-            y = compact(x)
+            y = sparse(x)
             y.sum().backward()
     finally:
         th.set_default_dtype(th.float32)
     close(y, expected)
-    assert compact[0].weight.grad.dtype == th.float32
+    assert sparse[0].weight.grad.dtype == th.float32
 
 
 def test_connections_that_change_between_the_passes_are_noticed():
-    _, compact = networks([5, 8, 3], ["full"], nn.ReLU, True, 0)
-    y = compact(th.randn(7, 5))
-    compact[0].restructure(Structure(np.arange(4), (8, 5)), th.ones(4))
+    _, sparse = networks([5, 8, 3], ["full"], nn.ReLU, True, 0)
+    y = sparse(th.randn(7, 5))
+    sparse[0].restructure(Structure(np.arange(4), (8, 5)), th.ones(4))
     with pytest.raises(RuntimeError, match="connections have changed between"):
         y.sum().backward()
 
 
-def test_layers_that_become_compact_later_join_the_chain():
+def test_layers_that_become_sparse_later_join_the_chain():
     dense, _ = networks([5, 8, 7, 3], ["some"], nn.ReLU, True, 0)
     sequence = copy.deepcopy(dense)
     x = th.randn(70, 5)
     for i in (2, 0, 4):
         mask = dense[i].mask
-        CompactLinear.convert(sequence[i], Structure.of_mask(mask, mask.shape), is_target=False)
+        SparseLinear.convert(sequence[i], Structure.of_mask(mask, mask.shape), is_target=False)
         chain_up(sequence)
         close(sequence(x), dense(x))
     assert len(sequence._steps) == 1
 
 
 def test_no_nan_is_seen_where_there_is_none():
-    _, compact = networks([5, 8, 3], ["some"], nn.Tanh, True, 0)
+    _, sparse = networks([5, 8, 3], ["some"], nn.Tanh, True, 0)
     th.use_deterministic_algorithms(True)  # fills what is not written with NaN
     try:
         with th.autograd.detect_anomaly(check_nan=True):
-            compact(th.randn(100, 5)).sum().backward()
+            sparse(th.randn(100, 5)).sum().backward()
     finally:
         th.use_deterministic_algorithms(False)
 
 
 def test_what_is_hooked_everywhere_is_called_by_itself():
-    dense, compact = networks([5, 8, 3], ["some"], nn.ReLU, True, 0)
+    dense, sparse = networks([5, 8, 3], ["some"], nn.ReLU, True, 0)
     shapes = []
     handle = nn.modules.module.register_module_forward_hook(
         lambda module, inputs, y: shapes.append(tuple(y.shape))
     )
-    compact(th.randn(7, 5))
+    sparse(th.randn(7, 5))
     handle.remove()
     assert shapes == [(7, 8), (7, 8), (7, 3), (7, 3)]
 
 
 def test_weights_that_the_kernels_cannot_read_are_refused():
-    _, compact = networks([5, 8, 3], ["some"], nn.ReLU, True, 0)
-    compact[0].bias.data = th.zeros(16)[::2]
+    _, sparse = networks([5, 8, 3], ["some"], nn.ReLU, True, 0)
+    sparse[0].bias.data = th.zeros(16)[::2]
     with pytest.raises(UnsupportedError, match="must be contiguous float32"):
-        compact(th.randn(7, 5))
+        sparse(th.randn(7, 5))
 
 
 def chained(*modules: nn.Module) -> nn.Sequential:

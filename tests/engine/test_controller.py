@@ -265,8 +265,8 @@ def test_a_plan_of_a_training_that_is_over_is_dropped_at_the_next_one():
     assert controller.plan is None
 
 
-@pytest.mark.parametrize("compact", [False, True])
-def test_weight_decay_is_coupled_added_after_clipping_and_on_kernels_only(compact):
+@pytest.mark.parametrize("sparse", [False, True])
+def test_weight_decay_is_coupled_added_after_clipping_and_on_weights_only(sparse):
     owner = nn.Sequential(nn.Linear(4, 3))
     owner.optimizer = th.optim.SGD(owner.parameters(), lr=1.0)
     network = SparseNetwork("net", owner, [("0", owner[0])])
@@ -276,8 +276,8 @@ def test_weight_decay_is_coupled_added_after_clipping_and_on_kernels_only(compac
         owner[0].bias.fill_(2.0)
     network.layers[0].set_mask(np.tile([True, False], 6))
     controller.attach()
-    if compact:
-        controller.compact(owner)
+    if sparse:
+        controller.to_sparse(owner)
     (owner[0].weight.sum() + owner[0].bias.sum()).backward()
     # 6 active weights and 3 biases with gradient 1: norm 3, clipped to 1.5.
     nn.utils.clip_grad_norm_(owner.parameters(), 1.5)
@@ -288,13 +288,13 @@ def test_weight_decay_is_coupled_added_after_clipping_and_on_kernels_only(compac
     np.testing.assert_allclose(owner[0].bias.detach(), 1.5, rtol=1e-5)
 
 
-@pytest.mark.parametrize("compact", [False, True])
+@pytest.mark.parametrize("sparse", [False, True])
 @pytest.mark.parametrize("twice", ["in one pass", "in one loss"])
-def test_rigl_sees_the_sum_of_a_layers_gradients_where_it_is_used_twice(compact, twice):
+def test_rigl_sees_the_sum_of_a_layers_gradients_where_it_is_used_twice(sparse, twice):
     """Each use alone would have grown another connection."""
     owner, layer, controller = rig(drop_fraction=1 / 6)  # one of six
-    if compact:
-        controller.compact(owner)
+    if sparse:
+        controller.to_sparse(owner)
         layer = controller.networks[0].layers[0]
     # The gradient of weight (i, j) is g_i x_j: flat 7 gets 3 + 3, flat 11 gets 5, flat 2 gets 4.
     uses = [
@@ -320,7 +320,7 @@ class ByGradient(TopologyMethod):
     name = "gradient-prune-for-tests"
     needs_gradient = True
 
-    def exchange(self, layer, moment, *, dense_grad):
+    def exchange(self, layer, update, *, dense_grad):
         score = np.where(layer.mask(), np.abs(dense_grad), np.inf)
         return Exchange(dropped=np.array([score.argmin()]), grown=np.empty(0, dtype=np.int64))
 
@@ -342,7 +342,7 @@ class Greedy(TopologyMethod):
     name = "greedy-for-tests"
     options = frozenset()
 
-    def exchange(self, layer, moment, *, dense_grad):
+    def exchange(self, layer, update, *, dense_grad):
         inactive = np.flatnonzero(~layer.mask())[:1]
         return Exchange(dropped=inactive, grown=np.empty(0, dtype=np.int64))
 

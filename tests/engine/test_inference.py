@@ -18,8 +18,8 @@ from sb3_sparse.engine.activations import ACTIVATIONS
 from sb3_sparse.engine.gaussian import gaussian, squashed
 from sb3_sparse.engine.inference import Inference
 from sb3_sparse.engine.kept import KeptInference
-from sb3_sparse.engine.linear import CompactLinear
-from sb3_sparse.engine.masked import MaskedLayer
+from sb3_sparse.engine.linear import SparseLinear
+from sb3_sparse.engine.masked import MaskedStorage
 from sb3_sparse.engine.native import library
 from sb3_sparse.engine.structure import Structure
 
@@ -33,7 +33,7 @@ ELEMENTWISE = [
     partial(nn.LeakyReLU, 0.2),
     partial(nn.Hardtanh, -0.5, 0.75),
 ]
-STORAGES = ("plain", "masked", "compact")
+STORAGES = ("plain", "masked", "sparse")
 
 
 def stored(layer: nn.Linear, storage: str, density: float, random: np.random.Generator):
@@ -42,17 +42,17 @@ def stored(layer: nn.Linear, storage: str, density: float, random: np.random.Gen
     if storage == "plain":
         return layer
     if storage == "masked":
-        masked = MaskedLayer("layer", layer)
+        masked = MaskedStorage("layer", layer)
         masked.set_mask(mask)
         return layer
     with th.no_grad():
         layer.weight.mul_(th.from_numpy(mask))
-    return CompactLinear.convert(layer, Structure.of_mask(mask, mask.shape), is_target=False)
+    return SparseLinear.convert(layer, Structure.of_mask(mask, mask.shape), is_target=False)
 
 
 def dense_twin(layer: nn.Linear) -> nn.Linear:
     twin = nn.Linear(layer.in_features, layer.out_features, bias=layer.bias is not None).double()
-    dense = layer.dense() if isinstance(layer, CompactLinear) else layer.weight
+    dense = layer.dense() if isinstance(layer, SparseLinear) else layer.weight
     with th.no_grad():
         twin.weight.copy_(dense)
         if layer.bias is not None:
@@ -122,7 +122,7 @@ def test_every_activation_is_torchs_from_end_to_end_of_its_range(instructions, a
 
 
 def test_heads_share_their_trunk(instructions):
-    trunk = network([5, 8, 9], ["compact"], nn.Tanh)
+    trunk = network([5, 8, 9], ["sparse"], nn.Tanh)
     heads = nn.Linear(9, 2), nn.Linear(9, 3)
     other = nn.Linear(5, 4)
     found = Inference.of([[trunk, heads[0]], [trunk, heads[1]], [other]])
@@ -169,7 +169,7 @@ def test_inputs_that_it_does_not_take_and_results_without_end_are_left_to_the_mo
 
 
 def test_whoever_watches_gets_the_modules():
-    net = network([5, 4, 3], ["compact", "masked"], nn.Tanh)
+    net = network([5, 4, 3], ["sparse", "masked"], nn.Tanh)
     found = Inference.of([[net]])
     x = th.randn(2, 5)
     for module in (net[0], net[1]):
@@ -188,7 +188,7 @@ def test_whoever_watches_gets_the_modules():
 
 
 def test_an_input_that_is_not_contiguous_is_read_right():
-    net = network([5, 4, 3], ["compact"], nn.Tanh)
+    net = network([5, 4, 3], ["sparse"], nn.Tanh)
     x = th.randn(5, 4).T
     close(Inference.of([[net]])(x)[0], by_modules(net, x))
 
@@ -196,7 +196,7 @@ def test_an_input_that_is_not_contiguous_is_read_right():
 @pytest.mark.parametrize("kind", [np.float32, np.float64])
 @pytest.mark.parametrize("count", [1, 4, 16])
 def test_observations_of_any_shape_are_flattened_and_rounded(kind, count, instructions):
-    net = network([6, 4, 3], ["compact", "masked"], nn.Tanh)
+    net = network([6, 4, 3], ["sparse", "masked"], nn.Tanh)
     found = Inference.of([[net]])
     x = np.random.default_rng(0).normal(size=(count, 2, 3)).astype(kind)
     expected = by_modules(net, th.from_numpy(x).float().flatten(1))
@@ -240,13 +240,13 @@ def new_data(net):
 
 def move(net):
     layer = net[0]
-    if isinstance(layer, CompactLinear):
+    if isinstance(layer, SparseLinear):
         dense = layer.dense()
         layer.take(
             Structure.of_mask(dense.numpy() == 0, layer.structure.shape), th.ones_like(dense)
         )
     else:
-        mask = MaskedLayer.of(layer)
+        mask = MaskedStorage.of(layer)
         mask.set_mask(~mask.mask())
         mask.write(th.ones(layer.weight.shape))
 
@@ -267,7 +267,7 @@ def steeper(net):
     net[1].alpha = 4.0
 
 
-@pytest.mark.parametrize("storage", ["masked", "compact"])
+@pytest.mark.parametrize("storage", ["masked", "sparse"])
 @pytest.mark.parametrize(
     "change", [write, new_data, move, exchange, new_layer, new_parameter, steeper]
 )
@@ -307,7 +307,7 @@ def test_what_is_inactive_counts_as_zero_whoever_wrote_it(instructions):
     x = th.randn(4, 5)
     expected = by_modules(net, x)
     for layer in (net[0], net[2]):
-        inactive = MaskedLayer.of(layer).float_mask == 0
+        inactive = MaskedStorage.of(layer).float_mask == 0
         layer.weight.data[inactive] = th.tensor([th.nan, th.inf, 3.0]).repeat(30)[: inactive.sum()]
     for batch in (1, 4):
         close(Inference.of([[net]])(x[:batch])[0], expected[:batch])
@@ -317,11 +317,11 @@ def test_modules_that_take_over_see_no_inactive_weight_either():
     net = network([5, 6, 3], ["masked"], nn.Tanh)
     net[0].weight.data.add_(1.0)
     assert Inference.of([[net]])(th.full((1, 5), th.nan)) is None
-    assert (net[0].weight[MaskedLayer.of(net[0]).float_mask == 0] == 0).all()
+    assert (net[0].weight[MaskedStorage.of(net[0]).float_mask == 0] == 0).all()
 
 
 def test_copies_and_pickles_begin_empty():
-    net = network([5, 6, 3], ["compact"], nn.Tanh)
+    net = network([5, 6, 3], ["sparse"], nn.Tanh)
     kept = KeptInference()
     assert kept.get(lambda: ([[net]], [net])) is not None
     for twin in (copy.deepcopy(kept), pickle.loads(pickle.dumps(kept))):
@@ -376,7 +376,7 @@ def test_layers_that_do_not_fit_each_other_are_left_to_the_modules():
     assert Inference.of([[net]]) is None
 
 
-@pytest.mark.parametrize("storage", ["masked", "compact"])
+@pytest.mark.parametrize("storage", ["masked", "sparse"])
 def test_weights_of_another_size_are_never_read(storage):
     net = network([5, 6, 3], [storage], nn.Tanh)
     found = Inference.of([[net]])
@@ -393,7 +393,7 @@ def test_a_target_that_awaits_its_copy_is_left_to_its_module():
     layer = nn.Linear(4, 3)
     dense = layer.weight.detach().clone()
     mask = np.arange(12) % 2 == 0
-    target = CompactLinear.convert(layer, Structure.of_mask(mask, (3, 4)), is_target=True)
+    target = SparseLinear.convert(layer, Structure.of_mask(mask, (3, 4)), is_target=True)
     assert target.snapshot is not None  # it still has weights that the mask has not
     found = Inference.of([[target]])
     assert found(th.randn(1, 4)) is None
@@ -404,7 +404,7 @@ def test_a_target_that_awaits_its_copy_is_left_to_its_module():
 
 
 def test_a_method_that_was_patched_is_called():
-    net = network([5, 4, 3], ["compact"], nn.Tanh)
+    net = network([5, 4, 3], ["sparse"], nn.Tanh)
     net[2].forward = lambda x: x[:, :3]
     assert Inference.of([[net]]) is None
 
@@ -420,7 +420,7 @@ def test_connections_that_another_thread_moves_are_never_read_halfway():
 
 
 def test_what_the_kernels_cannot_read_costs_no_waiting():
-    net = network([5, 6, 3], ["compact", "plain"], nn.Tanh)
+    net = network([5, 6, 3], ["sparse", "plain"], nn.Tanh)
     net[2].double()
     found = Inference.of([[net]])
     x = th.randn(1, 5)

@@ -53,7 +53,7 @@ def test_sparse_without_kernels_is_an_error_and_auto_trains_with_masks(relocated
     with pytest.raises(MissingKernels, match="or use compute='masked'"):
         make("SAC", policy_kwargs=dict(compute="sparse"))
     model = make("SAC", policy_kwargs=dict(compute="auto", net_arch=[200, 200])).learn(23)
-    assert not any(layer.compact for layer in model.policy.sparse.layers)
+    assert not any(layer.is_sparse for layer in model.policy.sparse.layers)
 
 
 def test_a_damaged_library_does_not_load(relocated):

@@ -157,6 +157,6 @@ def test_an_actor_without_hidden_layers(to, tmp_path):
 
 def test_a_policy_that_computes_on_its_non_zeros(tmp_path):
     model = trained("SAC", policy_kwargs=dict(compute="sparse"))
-    assert all(layer.compact for layer in model.policy.sparse.layers)
+    assert all(layer.is_sparse for layer in model.policy.sparse.layers)
     check(model, tmp_path, "c")
     check(model, tmp_path, "dense")

@@ -195,7 +195,7 @@ def test_layers_in_modules_of_the_users_are_told_as_the_policy_has_them(policy, 
     own = {r.name: r.compute for r in model.policy.sparsity_report().layers}
     found = inspect_model(tmp_path / "model.zip").report.layers
     assert {r.name: r.compute for r in found} == own
-    assert ("non-zeros" in own.values()) == (policy == "SparsePolicy")
+    assert ("sparse" in own.values()) == (policy == "SparsePolicy")
 
 
 def test_convolutions_of_unknown_strides_have_no_flops_but_all_else(tmp_path):

@@ -247,7 +247,7 @@ def test_inactive_weights_do_not_act_whoever_wrote_them(model, count):
     obs = observations(model, count)
     expected, _ = model.predict(obs, deterministic=True)
     for layer in model.policy.sparse.layers:
-        if not layer.compact:
+        if not layer.is_sparse:
             with th.no_grad():
                 layer.weight.add_(5.0 * (1 - layer.float_mask))
     np.testing.assert_allclose(model.predict(obs, deterministic=True)[0], expected, atol=1e-6)
@@ -463,7 +463,7 @@ def test_parameters_of_a_distribution_of_the_users_own_act(how):
 
     if how == "class":
         actor.__class__ = type("Own", (kind,), {"get_action_dist_params": params})
-        actor.quicken()
+        actor.use_kernels()
     else:
         actor.get_action_dist_params = params.__get__(actor)
     assert acted(model) == [[0.0], [0.0]]

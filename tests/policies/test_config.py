@@ -80,4 +80,4 @@ def test_a_start_sparser_than_the_end_is_refused():
 
 def test_json_lists_are_accepted_where_policy_kwargs_came_from_a_file():
     model = make("SAC", policy_kwargs=dict(dense_layers=["output"]))
-    assert model.policy.sparse.networks[0].dense_kernels
+    assert model.policy.sparse.networks[0].dense_layers

@@ -32,7 +32,7 @@ OUTPUTS = {
 
 
 def dense_names(model) -> set[str]:
-    return {name for network in model.policy.sparse.networks for name, _ in network.dense_kernels}
+    return {name for network in model.policy.sparse.networks for name, _ in network.dense_layers}
 
 
 @pytest.mark.parametrize("name", sorted(INPUTS))
@@ -93,7 +93,7 @@ def test_leaving_a_whole_network_dense_is_refused():
         make("SAC", policy_kwargs=dict(dense_layers=["actor"]))
 
 
-def test_weight_decay_reaches_dense_kernels_too_and_no_bias():
+def test_weight_decay_reaches_dense_layers_too_and_no_bias():
     plain, decayed = (
         make("DQN", policy_kwargs=dict(dense_layers=["output"], weight_decay=weight_decay))
         for weight_decay in (0.0, 0.5)

@@ -131,10 +131,10 @@ def test_groups_and_settings_of_a_policys_own_optimizer_are_kept(name):
         def _build(self, lr_schedule):
             super()._build(lr_schedule)
             owner = self.actor if name == "SAC" else self
-            kernels = [p for p in owner.parameters() if p.dim() > 1]
+            weights = [p for p in owner.parameters() if p.dim() > 1]
             others = [p for p in owner.parameters() if p.dim() < 2]
             owner.optimizer = th.optim.Adam(
-                [{"params": kernels, "lr": 0.5}, {"params": others, "betas": (0.1, 0.2)}],
+                [{"params": weights, "lr": 0.5}, {"params": others, "betas": (0.1, 0.2)}],
                 lr=0.1,
                 eps=1e-3,
                 amsgrad=True,

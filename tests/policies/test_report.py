@@ -70,8 +70,8 @@ def test_the_table_names_every_layer_and_the_totals():
 @pytest.mark.parametrize(
     ("compute", "inner", "full"),
     [
-        ("auto", "non-zeros", "dense"),
-        ("sparse",) + 2 * ("non-zeros",),
+        ("auto", "sparse", "dense"),
+        ("sparse",) + 2 * ("sparse",),
         ("masked", "masked", "dense"),
     ],
 )
@@ -79,7 +79,9 @@ def test_every_row_says_how_the_layer_computes(compute, inner, full):
     kwargs = dict(net_arch=[200, 200], compute=compute, dense_layers=["actor.latent_pi.0"])
     report = make("SAC", policy_kwargs=kwargs).policy.sparsity_report()
     rows = {row.name: row for row in report.layers}
-    assert rows["actor.latent_pi.0"].compute == "dense"  # no sparse layer, so never on non-zeros
+    assert (
+        rows["actor.latent_pi.0"].compute == "dense"
+    )  # no sparse layer, so never in sparse storage
     assert rows["actor.latent_pi.2"].compute == rows["critic.qf1.2"].compute == inner
     assert rows["actor.mu"].density == 1.0  # within the budget, which gives it all 200
     assert rows["actor.mu"].compute == full

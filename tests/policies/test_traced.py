@@ -1,4 +1,4 @@
-"""Policies that compute on non-zeros, seen by torch's tracers as SB3's documentation has it."""
+"""Policies in sparse storage, seen by torch's tracers as SB3's documentation has it."""
 
 import io
 
@@ -33,7 +33,7 @@ def activation(request):
 def network(request, activation):
     kwargs = dict(compute="sparse", activation_fn=activation)
     policy = make(ALGORITHMS[request.param], policy_kwargs=kwargs).policy
-    assert any(layer.compact for layer in policy.sparse.layers)
+    assert any(layer.is_sparse for layer in policy.sparse.layers)
     acting = getattr(policy, "actor", None) or getattr(policy, "q_net", None) or policy
     direct = request.param in ("TD3", "DQN")
     return (acting if direct else Deterministic(acting)).eval()

@@ -237,7 +237,7 @@ def test_known_distributions_pass_the_check():
 
 
 @pytest.mark.parametrize("shape", [(), (5,), (0, 3), (3, 0), (4, -2), (4, 4, 0, 3)])
-def test_shape_that_is_no_kernel_is_an_error_that_shows_it(shape):
+def test_a_shape_that_is_no_weight_is_an_error_that_shows_it(shape):
     with pytest.raises(ConfigError, match="two or more positive dimensions") as caught:
         active_counts([(4, 4), shape], 0.5)
     assert repr(shape) in str(caught.value)

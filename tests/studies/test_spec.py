@@ -232,7 +232,7 @@ def test_three_studies_have_a_scale_medium():
 
 
 def test_dense_widths_of_the_actor_critic_study_keep_their_budget():
-    """Kernels of HalfCheetah's SAC (17 observations, 6 actions, two critics), counted by hand."""
+    """Weights of HalfCheetah's SAC (17 observations, 6 actions, two critics), counted by hand."""
     for cell in Study.read("actor_critic", "small").cells:
         arch = cell.run.hyperparams.get("net_arch")
         if arch is None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from sb3_sparse.topology import Exchange, Moment
+from sb3_sparse.topology import Exchange, MaskUpdate
 
 
 @dataclass(frozen=True)
@@ -68,11 +68,11 @@ def make_layer():
 
 
 @pytest.fixture(scope="session")
-def make_moment():
+def make_update():
     """Maker of moments, at the start of training unless said otherwise."""
 
     def make(progress=0.0, drop_fraction=0.5, step=1000, begin=0.0, end=0.8, seed=0):
-        return Moment(
+        return MaskUpdate(
             step=step,
             progress=progress,
             begin=begin,

@@ -19,13 +19,13 @@ def dense_layer(make_layer):
 
 
 @pytest.fixture
-def at(make_moment):
-    """Moment of a progress on the ramp from 0.2 to 0.8."""
-    return lambda progress: make_moment(progress=progress, begin=0.2, end=0.8, drop_fraction=0.0)
+def at(make_update):
+    """MaskUpdate of a progress on the ramp from 0.2 to 0.8."""
+    return lambda progress: make_update(progress=progress, begin=0.2, end=0.8, drop_fraction=0.0)
 
 
-def pruned(layer, moment):
-    exchange = method_named("prune").exchange(layer, moment, dense_grad=None)
+def pruned(layer, update):
+    exchange = method_named("prune").exchange(layer, update, dense_grad=None)
     assert exchange.grown.size == 0
     layer.after(exchange)
     return exchange.dropped.tolist()
@@ -91,10 +91,10 @@ def test_an_active_weight_of_zero_goes_before_any_other(make_layer, at):
     assert pruned(layer, at(0.8)) == [1]
 
 
-def test_the_gradient_the_step_and_the_seed_do_not_matter(dense_layer, make_moment):
+def test_the_gradient_the_step_and_the_seed_do_not_matter(dense_layer, make_update):
     prune = method_named("prune")
-    moment = make_moment(progress=0.5, begin=0.2, end=0.8, step=31, seed=9, drop_fraction=0.7)
-    exchange = prune.exchange(dense_layer, moment, dense_grad=np.arange(12.0))
+    update = make_update(progress=0.5, begin=0.2, end=0.8, step=31, seed=9, drop_fraction=0.7)
+    exchange = prune.exchange(dense_layer, update, dense_grad=np.arange(12.0))
     assert exchange.dropped.tolist() == [1, 2, 3, 6, 7, 8, 11]
 
 
@@ -105,13 +105,13 @@ def test_the_gradient_the_step_and_the_seed_do_not_matter(dense_layer, make_mome
     path=st.lists(st.floats(0, 1), max_size=6).map(sorted),
 )
 def test_the_mask_only_shrinks_and_ends_with_the_largest(
-    make_layer, make_moment, weights, data, path
+    make_layer, make_update, weights, data, path
 ):
     final = data.draw(st.integers(1, len(weights)))
     layer = make_layer(weights, active=range(len(weights)), final_nnz=final)
     for progress in [*path, 1.0]:
-        moment = make_moment(progress=progress, begin=0.2, end=0.8)
-        exchange = method_named("prune").exchange(layer, moment, dense_grad=None)
+        update = make_update(progress=progress, begin=0.2, end=0.8)
+        exchange = method_named("prune").exchange(layer, update, dense_grad=None)
         smaller = layer.after(exchange)
         assert smaller.active <= layer.active
         layer = smaller

@@ -24,7 +24,7 @@ def method_class(class_name: str, method_name: str, module: str = "somewhere") -
         "__module__": module,
         "__qualname__": class_name,
         "name": method_name,
-        "exchange": lambda self, layer, moment, *, dense_grad: NOTHING,
+        "exchange": lambda self, layer, update, *, dense_grad: NOTHING,
     }
     return type(class_name, (TopologyMethod,), body)
 
@@ -104,7 +104,7 @@ def test_a_class_without_a_usable_name_is_an_error_that_says_how_to_name_it(name
 
 def test_a_class_that_never_set_a_name_is_an_error():
     class Nameless(DropGrow):
-        def scores(self, layer, moment, candidates, *, dense_grad):
+        def scores(self, layer, update, candidates, *, dense_grad):
             return candidates
 
     with pytest.raises(ConfigError, match="needs a class attribute `name`"):

@@ -30,7 +30,7 @@ from sb3_sparse.zoo.training import resume, train
 LARGE = {"net_arch": [200, 200], "batch_size": 16, "learning_starts": 50, "update_interval": 20}
 QUICK = dict(eval_freq=200, eval_episodes=1)
 NAMES = ["q_net.q_net.0", "q_net.q_net.2", "q_net.q_net.4"]
-"""4-200-200-2: 40,000 connections in the middle, so one run of layers that may be compact."""
+"""4-200-200-2: 40,000 connections in the middle, so one chain of layers that may be sparse."""
 
 
 SITTING = dict(
@@ -62,11 +62,11 @@ def trained(tmp_path_factory) -> Path:
 
 def test_the_record_says_what_was_asked_for_and_what_decides_rounding(trained):
     found = computing_in(read_record(trained), trained)
-    compact = dict.fromkeys(NAMES, "non-zeros")
+    sparse = dict.fromkeys(NAMES, "sparse")
     capability = th.backends.cpu.get_cpu_capability()
-    sitting = Sitting(0, library.in_use(), capability, th.get_num_threads(), compact, "fused")
+    sitting = Sitting(0, library.in_use(), capability, th.get_num_threads(), sparse, "fused")
     assert found == Computing("auto", (sitting,))
-    assert layers_of(trained) == compact
+    assert layers_of(trained) == sparse
 
 
 def test_masks_that_are_asked_for_are_on_record(tmp_path):
@@ -81,9 +81,9 @@ def test_pruning_changes_how_layers_compute_and_the_record_has_both(tmp_path):
     folder = train(pruned, tmp_path).folder
     (sitting,) = computing_in(read_record(folder), folder).sittings
     assert sitting.layers == dict.fromkeys(NAMES, "dense")
-    assert layers_of(folder) == dict.fromkeys(NAMES, "non-zeros")
+    assert layers_of(folder) == dict.fromkeys(NAMES, "sparse")
     told = str(inspect_model(folder))
-    assert "Trained from step 0: 0 of 3 layers on non-zeros" in told
+    assert "Trained from step 0: 0 of 3 layers in sparse storage" in told
 
 
 def test_a_run_that_is_gone_on_with_has_a_sitting_more(tmp_path):
@@ -94,7 +94,7 @@ def test_a_run_that_is_gone_on_with_has_a_sitting_more(tmp_path):
     first, second = computing_in(read_record(stopped.folder), stopped.folder).sittings
     assert (first.num_timesteps, second.num_timesteps) == (0, steps)
     assert first.layers == dict.fromkeys(NAMES, "dense")
-    assert second.layers == dict.fromkeys(NAMES, "non-zeros")  # before its first gradient step
+    assert second.layers == dict.fromkeys(NAMES, "sparse")  # before its first gradient step
 
 
 def test_sittings_that_came_to_nothing_are_forgotten(trained):
@@ -112,9 +112,9 @@ def test_inspect_tells_what_the_record_says_not_what_would_be_chosen_here(
     monkeypatch.setattr("sb3_sparse.zoo.inspection.choose", lambda *_: [])
     for path in (trained, trained / "best_model.zip"):
         found = inspect_model(path)
-        assert [layer.compute for layer in found.report.layers] == ["non-zeros"] * 3
+        assert [layer.compute for layer in found.report.layers] == ["sparse"] * 3
         assert "The run asked for compute='auto'." in str(found)
-        assert f"3 of 3 layers on non-zeros, {library.in_use()} kernels" in str(found)
+        assert f"3 of 3 layers in sparse storage, {library.in_use()} kernels" in str(found)
         assert str(found).endswith(", 1 thread, gradient steps fused.")
     shutil.copy(trained / "best_model.zip", tmp_path)
     best = inspect_model(tmp_path / "best_model.zip")
@@ -144,7 +144,15 @@ def test_records_of_older_versions_are_read(trained, record):
     (trained / "sparsity.json").write_text(json.dumps(record))
     found = inspect_model(trained)
     assert found.computing is None
-    assert "compute='auto': 3 of 3 layers compute on non-zeros here" in str(found)
+    assert "compute='auto': 3 of 3 layers in sparse storage here" in str(found)
+
+
+def test_records_that_say_non_zeros_are_read_as_sparse(trained, record):
+    now = inspect_model(trained)
+    former = json.dumps(record).replace('"sparse"', '"non-zeros"')
+    assert former.count('"non-zeros"') == 2 * len(NAMES)  # in layers, and in the one sitting
+    (trained / "sparsity.json").write_text(former)
+    assert inspect_model(trained) == now
 
 
 @pytest.mark.parametrize(

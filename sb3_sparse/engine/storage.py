@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from torch import nn
 
 from sb3_sparse.engine.gradients import GradientMask
-from sb3_sparse.engine.kernels import Kernel, check_plain
 from sb3_sparse.engine.linear import MASK_KEY
+from sb3_sparse.engine.prunable import Prunable, check_plain
 from sb3_sparse.errors import CorruptStateError, TopologyError, UnsupportedError
 from sb3_sparse.topology import Exchange
 
 
-class SparseLayer(ABC):
+class LayerStorage(ABC):
     """A layer of a network within its budget.
 
     :param name: dotted name within the policy
@@ -26,7 +26,7 @@ class SparseLayer(ABC):
     :param shape: of the dense weight
     """
 
-    def __init__(self, name: str, module: Kernel, shape: tuple[int, ...]) -> None:
+    def __init__(self, name: str, module: Prunable, shape: tuple[int, ...]) -> None:
         self.name = name
         self.module = module
         self.shape = shape
@@ -63,12 +63,12 @@ class SparseLayer(ABC):
 
     @property
     @abstractmethod
-    def targets(self) -> Sequence[Kernel]:
+    def targets(self) -> Sequence[Prunable]:
         """Target copies of the layer."""
 
     @property
     @abstractmethod
-    def compact(self) -> bool:
+    def is_sparse(self) -> bool:
         """Whether only active connections are stored and computed."""
 
     @abstractmethod
@@ -240,29 +240,29 @@ def moments_of(
 
 
 def save_moments(
-    optimizer: th.optim.Optimizer, state_dict: dict[str, Any], layers: Iterable[SparseLayer]
+    optimizer: th.optim.Optimizer, state_dict: dict[str, Any], layers: Iterable[LayerStorage]
 ) -> None:
-    """Show moments of compact layers in an optimizer's state_dict as those of masked ones."""
+    """Show moments of sparse layers in an optimizer's state_dict as those of masked ones."""
     parameters = [p for group in optimizer.param_groups for p in group["params"]]
     numbers = {id(parameter): number for number, parameter in enumerate(parameters)}
     for layer in layers:
         number = numbers.get(id(layer.weight))
-        if layer.compact and number in state_dict["state"]:
+        if layer.is_sparse and number in state_dict["state"]:
             state_dict["state"][number] = {
                 key: layer.saved_moment(value) if isinstance(value, th.Tensor) else value
                 for key, value in state_dict["state"][number].items()
             }
 
 
-def check_masked(optimizer: th.optim.Optimizer, layers: Iterable[SparseLayer]) -> None:
-    """Refuse compact layers under an optimizer that does not move each weight by itself.
+def check_masked(optimizer: th.optim.Optimizer, layers: Iterable[LayerStorage]) -> None:
+    """Reject sparse storage under an optimizer that does not move each weight by itself.
 
-    :raises UnsupportedError: if one is compact
+    :raises UnsupportedError: if a layer is in sparse storage
     """
-    compact = next((layer.name for layer in layers if layer.compact), None)
-    if compact is not None:
+    sparse = next((layer.name for layer in layers if layer.is_sparse), None)
+    if sparse is not None:
         raise UnsupportedError(
             f"{type(optimizer).__name__} does not move each weight by itself, as Adam does, so it "
-            f"cannot move layers that store active connections only ({compact}); make the policy "
+            f"cannot move layers that store active connections only ({sparse}); make the policy "
             "with compute='masked', or use another optimizer_class"
         )

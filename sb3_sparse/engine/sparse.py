@@ -12,23 +12,23 @@ from numpy.typing import NDArray
 from torch import nn
 
 from sb3_sparse.engine.gradients import DenseGradient, GradientMask, weakly
-from sb3_sparse.engine.layers import SparseLayer, moments_of
-from sb3_sparse.engine.linear import CompactLinear
-from sb3_sparse.engine.masked import MaskedLayer
+from sb3_sparse.engine.linear import SparseLinear
+from sb3_sparse.engine.masked import MaskedStorage
+from sb3_sparse.engine.storage import LayerStorage, moments_of
 from sb3_sparse.engine.structure import Structure
 from sb3_sparse.errors import UnsupportedError
 
 
-class CompactLayer(SparseLayer):
+class SparseStorage(LayerStorage):
     """A linear layer stored as the values of its active connections and their indices.
 
     :param layer: the same layer, masked; it is taken apart
     :param optimizers: whose moments of the weight shall follow
     """
 
-    module: CompactLinear
+    module: SparseLinear
 
-    def __init__(self, layer: MaskedLayer, optimizers: Sequence[th.optim.Optimizer] = ()) -> None:
+    def __init__(self, layer: MaskedStorage, optimizers: Sequence[th.optim.Optimizer] = ()) -> None:
         assert isinstance(layer.module, nn.Linear)
         super().__init__(layer.name, layer.module, layer.shape)
         self.initial_nnz, self.final_nnz = layer.initial_nnz, layer.final_nnz
@@ -37,7 +37,7 @@ class CompactLayer(SparseLayer):
         self._structure = structure
         """What targets and moments go by; differs from the module's after a load."""
         layer.release()
-        self.module = CompactLinear.convert(layer.module, structure, is_target=False)
+        self.module = SparseLinear.convert(layer.module, structure, is_target=False)
         self.module.check_mask = self.check_mask
         self._targets = []
         self._hooks = [
@@ -45,17 +45,17 @@ class CompactLayer(SparseLayer):
         ]
         for target in layer.targets:
             assert isinstance(target, nn.Linear)
-            self._targets.append(CompactLinear.convert(target, structure, is_target=True))
+            self._targets.append(SparseLinear.convert(target, structure, is_target=True))
             hook = target.register_load_state_dict_post_hook(self._after_target_load)  # type: ignore[no-untyped-call]
             self._hooks.append(hook)
         self.settle_moments(optimizers)
 
     @property
-    def targets(self) -> Sequence[CompactLinear]:
+    def targets(self) -> Sequence[SparseLinear]:
         return self._targets
 
     @property
-    def compact(self) -> bool:
+    def is_sparse(self) -> bool:
         return True
 
     def mask(self) -> NDArray[np.bool_]:
@@ -86,7 +86,7 @@ class CompactLayer(SparseLayer):
         return (target.dense().numpy() for target in self._targets)
 
     def gradient_mask(self, functional: bool, capturing: Callable[[], bool]) -> GradientMask:
-        return CompactGradient(self, functional, capturing)
+        return SparseStorageGradient(self, functional, capturing)
 
     def settle_moments(self, optimizers: Sequence[th.optim.Optimizer]) -> None:
         structure = self.module.structure
@@ -127,7 +127,7 @@ class CompactLayer(SparseLayer):
         dense[th.from_numpy(self._structure.flat)] = moment
         return dense.view(self.shape)
 
-    def masked(self, optimizers: Sequence[th.optim.Optimizer]) -> MaskedLayer:
+    def to_masked(self, optimizers: Sequence[th.optim.Optimizer]) -> MaskedStorage:
         """The same layer in masked storage; this one is taken apart.
 
         :param optimizers: whose moments of the weight shall follow
@@ -139,8 +139,8 @@ class CompactLayer(SparseLayer):
             hook.remove()
         targets = [target.dense() for target in self._targets]
         for module in (self.module, *self._targets):
-            module.expand()
-        layer = MaskedLayer(self.name, self.module)
+            module.to_linear()
+        layer = MaskedStorage(self.name, self.module)
         layer.initial_nnz, layer.final_nnz = self.initial_nnz, self.final_nnz
         layer.set_mask(mask)
         layer.moments_stale = self.moments_stale
@@ -189,15 +189,15 @@ class CompactLayer(SparseLayer):
             self.mask_targets()
 
 
-class CompactGradient(GradientMask):
-    """Hears of a compact layer's dense gradient while the kernels go back through it.
+class SparseStorageGradient(GradientMask):
+    """Hears of a sparse layer's dense gradient while the kernels go back through it.
 
     :param functional: whether the algorithm uses ``torch.autograd.grad``: the first gradient is the
         one wanted then, else the last
     """
 
     def __init__(
-        self, layer: CompactLayer, functional: bool, capturing: Callable[[], bool]
+        self, layer: SparseStorage, functional: bool, capturing: Callable[[], bool]
     ) -> None:
         super().__init__(capturing)
         self.layer = layer
@@ -274,8 +274,8 @@ def _followed(
     return th.where(grown, scale * flat[th.from_numpy(after.flat)], moved)
 
 
-def compacted(layer: SparseLayer, optimizers: Sequence[th.optim.Optimizer]) -> SparseLayer:
-    """The layer in compact storage; one that is not linear, or compact already, as it is."""
-    if isinstance(layer, MaskedLayer) and type(layer.module) is nn.Linear:
-        return CompactLayer(layer, optimizers)
+def to_sparse(layer: LayerStorage, optimizers: Sequence[th.optim.Optimizer]) -> LayerStorage:
+    """The layer in sparse storage; one that is not linear, or sparse already, as it is."""
+    if isinstance(layer, MaskedStorage) and type(layer.module) is nn.Linear:
+        return SparseStorage(layer, optimizers)
     return layer

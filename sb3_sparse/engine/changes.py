@@ -16,7 +16,7 @@ def patched(module: nn.Module) -> bool:
     return any(callable(getattr(kind, name, None)) for name in vars(module))
 
 
-class Watch:
+class ChangeDetector:
     """Notices when a module gets or loses a child, a tensor or an attribute.
 
     That is how modules are replaced, patched, parametrized and pruned. What tensors hold may change

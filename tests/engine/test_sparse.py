@@ -1,4 +1,4 @@
-"""The compact storage beside the masked one: same moves, same moments, same saved form."""
+"""The sparse storage beside the masked one: same moves, same moments, same saved form."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from stable_baselines3.common.utils import polyak_update
 from torch import nn
 
-from sb3_sparse.engine.compact import CompactLayer
-from sb3_sparse.engine.linear import CompactLinear, replace_data
-from sb3_sparse.engine.masked import MaskedLayer
+from sb3_sparse.engine.linear import SparseLinear, replace_data
+from sb3_sparse.engine.masked import MaskedStorage
+from sb3_sparse.engine.sparse import SparseStorage
 from sb3_sparse.errors import CorruptStateError, TopologyError, UnsupportedError
 from sb3_sparse.topology import Exchange
 
@@ -23,19 +23,19 @@ ROWS, COLUMNS = 4, 6
 
 
 def twins(seed: int = 0, target: bool = True, optimizer=th.optim.Adam) -> list[SimpleNamespace]:
-    """The same layer, its target and its optimizer, masked and compact."""
+    """The same layer, its target and its optimizer, masked and sparse."""
     found = []
-    for compact in (False, True):
+    for sparse in (False, True):
         th.manual_seed(seed)
         module, copied = nn.Linear(COLUMNS, ROWS), nn.Linear(COLUMNS, ROWS)
-        layer = MaskedLayer("layer", module)
+        layer = MaskedStorage("layer", module)
         layer.set_mask(np.random.default_rng(seed).random((ROWS, COLUMNS)) < 0.5)
         layer.final_nnz = 1  # so masks of any count fit, as where pruning is under way
         if target:
             layer.add_target(copied)
         made = optimizer(module.parameters(), lr=0.1)
-        if compact:
-            layer = CompactLayer(layer, [made])
+        if sparse:
+            layer = SparseStorage(layer, [made])
         found.append(SimpleNamespace(layer=layer, module=module, target=copied, optimizer=made))
     return found
 
@@ -46,7 +46,7 @@ def step(side: SimpleNamespace, seed: int = 0) -> th.Tensor:
     x, g = (th.randn(5, n, generator=random) for n in (COLUMNS, ROWS))
     side.optimizer.zero_grad()
     side.module(x).backward(g)
-    if not side.layer.compact:
+    if not side.layer.is_sparse:
         side.module.weight.grad.mul_(side.layer.float_mask)
     side.optimizer.step()
     return g.T @ x
@@ -66,22 +66,22 @@ def moments(side: SimpleNamespace) -> list[np.ndarray]:
     return [side.layer.saved_moment(v).numpy() for v in state.values() if v.dim()]
 
 
-def same(masked: SimpleNamespace, compact: SimpleNamespace) -> None:
-    ours, theirs = compact.layer, masked.layer
+def same(masked: SimpleNamespace, sparse: SimpleNamespace) -> None:
+    ours, theirs = sparse.layer, masked.layer
     assert ours.nnz == theirs.nnz == int(theirs.mask().sum())
     np.testing.assert_array_equal(ours.mask(), theirs.mask())
     np.testing.assert_allclose(ours.dense(), theirs.dense(), rtol=1e-5, atol=5e-7)
-    for one, other in zip(moments(masked), moments(compact), strict=True):
+    for one, other in zip(moments(masked), moments(sparse), strict=True):
         np.testing.assert_allclose(other, one, rtol=1e-5, atol=1e-7)
     for name in ("module", "target"):
-        one, other = getattr(masked, name).state_dict(), getattr(compact, name).state_dict()
+        one, other = getattr(masked, name).state_dict(), getattr(sparse, name).state_dict()
         assert list(one) == list(other)
         for key in one:
             assert one[key].dtype == other[key].dtype
             np.testing.assert_allclose(other[key], one[key], rtol=1e-5, atol=5e-7, err_msg=key)
     if masked.module.weight.grad is not None:
         grown = masked.module.weight.grad.reshape(-1)[theirs.mask()]
-        np.testing.assert_allclose(compact.module.weight.grad, grown, rtol=1e-4, atol=1e-6)
+        np.testing.assert_allclose(sparse.module.weight.grad, grown, rtol=1e-4, atol=1e-6)
 
 
 @settings(max_examples=40, deadline=None)
@@ -93,7 +93,7 @@ def same(masked: SimpleNamespace, compact: SimpleNamespace) -> None:
     optimizer=st.sampled_from([th.optim.Adam, th.optim.RMSprop, th.optim.SGD]),
 )
 def test_any_moves_leave_both_storages_alike(seed, moves, soft, dense, optimizer):
-    masked, compact = sides = twins(seed, optimizer=optimizer)
+    masked, sparse = sides = twins(seed, optimizer=optimizer)
     for i, (drop, grow) in enumerate(moves):
         gradients = [step(side, i) for side in sides]
         exchange = exchange_of(masked.layer, drop, grow, i)
@@ -104,20 +104,20 @@ def test_any_moves_leave_both_storages_alike(seed, moves, soft, dense, optimizer
                 soft_targets=soft,
                 dense_grad=gradient if dense else None,
             )
-        same(masked, compact)
+        same(masked, sparse)
         for side in sides:
             tau = 0.5 if soft else 1.0
             if soft or i % 2:
                 polyak_update(side.module.parameters(), side.target.parameters(), tau)
-        same(masked, compact)
+        same(masked, sparse)
 
 
 def test_the_parameter_holds_the_active_values_by_rows():
-    masked, compact = twins()
-    assert compact.module.weight.shape == (masked.layer.nnz,)
-    assert isinstance(compact.module, nn.Linear)
+    masked, sparse = twins()
+    assert sparse.module.weight.shape == (masked.layer.nnz,)
+    assert isinstance(sparse.module, nn.Linear)
     np.testing.assert_array_equal(
-        compact.module.weight.detach(), masked.layer.dense()[masked.layer.mask()]
+        sparse.module.weight.detach(), masked.layer.dense()[masked.layer.mask()]
     )
 
 
@@ -171,22 +171,22 @@ def test_a_target_with_weights_outside_the_mask_keeps_them_when_loaded():
 
 
 def test_a_mask_of_another_layer_is_taken_over_with_moments_and_targets():
-    masked, compact = twins()
-    for side in (masked, compact):
+    masked, sparse = twins()
+    for side in (masked, sparse):
         step(side)
     other = twins(seed=5)[0]
-    for side in (masked, compact):
+    for side in (masked, sparse):
         side.optimizer.zero_grad()
         side.module.load_state_dict(other.module.state_dict())
         assert side.layer.moments_stale
         side.layer.settle_moments([side.optimizer])
         side.layer.mask_targets()
-    same(masked, compact)
+    same(masked, sparse)
 
 
 @pytest.mark.parametrize("first", ["module", "optimizer"])
 def test_either_storage_takes_up_what_the_other_saved(first):
-    masked, compact = twins()
+    masked, sparse = twins()
     step(masked)
     masked.optimizer.zero_grad()
     saved = copy.deepcopy((masked.module.state_dict(), masked.optimizer.state_dict()))
@@ -207,59 +207,59 @@ def test_either_storage_takes_up_what_the_other_saved(first):
 def test_loaded_moments_follow_a_move_that_comes_before_any_step():
     other = twins(seed=5)[0]
     step(other, 3)
-    masked, compact = twins()
-    for side in (masked, compact):
+    masked, sparse = twins()
+    for side in (masked, sparse):
         step(side)
         side.optimizer.zero_grad()
         side.module.load_state_dict(other.module.state_dict())
         side.optimizer.load_state_dict(copy.deepcopy(other.optimizer.state_dict()))
     exchange = exchange_of(masked.layer, 3, 2)
-    for side in (masked, compact):
+    for side in (masked, sparse):
         side.layer.move(exchange, [side.optimizer])
-    same(masked, compact)
+    same(masked, sparse)
 
 
 def test_weights_without_a_mask_are_masked():
-    _, compact = twins()
+    _, sparse = twins()
     dense = nn.Linear(COLUMNS, ROWS).state_dict()
     with pytest.raises(RuntimeError, match='Missing key.*"weight_mask"'):
-        compact.module.load_state_dict(dense)
-    compact.module.load_state_dict(dense, strict=False)
-    mask = compact.layer.mask()
-    np.testing.assert_array_equal(compact.layer.dense(), dense["weight"].reshape(-1) * mask)
+        sparse.module.load_state_dict(dense)
+    sparse.module.load_state_dict(dense, strict=False)
+    mask = sparse.layer.mask()
+    np.testing.assert_array_equal(sparse.layer.dense(), dense["weight"].reshape(-1) * mask)
 
 
 def test_an_exchange_that_does_not_fit_is_refused_and_changes_nothing():
-    _, compact = twins()
-    before = compact.layer.mask()
+    _, sparse = twins()
+    before = sparse.layer.mask()
     active = np.flatnonzero(before)
     with pytest.raises(TopologyError, match="some of the grown are"):
-        compact.layer.move(Exchange(active[:1], active[1:2]))
-    np.testing.assert_array_equal(compact.layer.mask(), before)
+        sparse.layer.move(Exchange(active[:1], active[1:2]))
+    np.testing.assert_array_equal(sparse.layer.mask(), before)
 
 
 def test_wrong_shapes_and_empty_masks_are_refused_at_load():
-    _, compact = twins()
-    saved = compact.module.state_dict()
+    _, sparse = twins()
+    saved = sparse.module.state_dict()
     with pytest.raises(RuntimeError, match=r"size mismatch for weight: .*\(4, 5\)"):
-        compact.module.load_state_dict({**saved, "weight": th.zeros(ROWS, 5)})
+        sparse.module.load_state_dict({**saved, "weight": th.zeros(ROWS, 5)})
     with pytest.raises(RuntimeError, match="size mismatch for weight_mask"):
-        compact.module.load_state_dict({**saved, "weight_mask": th.ones(3).bool()})
+        sparse.module.load_state_dict({**saved, "weight_mask": th.ones(3).bool()})
     with pytest.raises(CorruptStateError, match="has 0 of 24 connections"):
-        compact.module.load_state_dict({**saved, "weight_mask": th.zeros(ROWS, COLUMNS).bool()})
+        sparse.module.load_state_dict({**saved, "weight_mask": th.zeros(ROWS, COLUMNS).bool()})
     with pytest.raises(RuntimeError, match="Missing key"):
-        compact.module.load_state_dict({k: v for k, v in saved.items() if k != "weight"})
+        sparse.module.load_state_dict({k: v for k, v in saved.items() if k != "weight"})
 
 
 def test_copies_are_independent():
-    _, compact = twins()
-    twin = copy.deepcopy(compact)
+    _, sparse = twins()
+    twin = copy.deepcopy(sparse)
     step(twin)
     twin.layer.move(exchange_of(twin.layer, 3, 3), [twin.optimizer])
     assert twin.layer.module is twin.module
-    assert (twin.layer.mask() != compact.layer.mask()).any()
+    assert (twin.layer.mask() != sparse.layer.mask()).any()
     fresh = twins()[1]
-    np.testing.assert_array_equal(compact.layer.dense(), fresh.layer.dense())
+    np.testing.assert_array_equal(sparse.layer.dense(), fresh.layer.dense())
 
 
 def test_a_parameter_may_change_its_size_while_an_older_graph_is_alive():
@@ -273,19 +273,19 @@ def test_a_parameter_may_change_its_size_while_an_older_graph_is_alive():
     assert loss.grad_fn is not None
 
 
-def test_only_linear_layers_are_compacted():
-    from sb3_sparse.engine.compact import compacted
+def test_only_linear_layers_become_sparse():
+    from sb3_sparse.engine.sparse import to_sparse
 
-    conv = MaskedLayer("conv", nn.Conv2d(1, 2, 3))
-    assert compacted(conv, []) is conv
-    linear = compacted(MaskedLayer("linear", nn.Linear(2, 3)), [])
-    assert isinstance(linear.module, CompactLinear)
-    assert compacted(linear, []) is linear
+    conv = MaskedStorage("conv", nn.Conv2d(1, 2, 3))
+    assert to_sparse(conv, []) is conv
+    linear = to_sparse(MaskedStorage("linear", nn.Linear(2, 3)), [])
+    assert isinstance(linear.module, SparseLinear)
+    assert to_sparse(linear, []) is linear
 
 
 @pytest.mark.parametrize("where", [th.float64, "meta"])
 def test_only_float32_on_the_cpu(where):
-    _, compact = twins()
+    _, sparse = twins()
     with pytest.raises(UnsupportedError, match="make the policy with compute='masked'"):
-        compact.module.to(where)
-    assert compact.module.to("cpu") is compact.module
+        sparse.module.to(where)
+    assert sparse.module.to("cpu") is sparse.module

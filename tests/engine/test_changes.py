@@ -7,7 +7,7 @@ import torch as th
 from torch import nn
 from torch.nn.utils import parametrizations, prune
 
-from sb3_sparse.engine.watch import Watch
+from sb3_sparse.engine.changes import ChangeDetector
 
 
 @pytest.fixture
@@ -16,12 +16,12 @@ def network() -> nn.Sequential:
 
 
 def test_new_numbers_do_not_count(network):
-    watch = Watch(network.modules())
+    changes = ChangeDetector(network.modules())
     with th.no_grad():
         network[0].weight.mul_(2)
     network.train(False)
     network(th.randn(3, 3))
-    assert watch.unchanged()
+    assert changes.unchanged()
 
 
 @pytest.mark.parametrize(
@@ -40,14 +40,14 @@ def test_new_numbers_do_not_count(network):
     ],
 )
 def test_a_change_of_what_modules_hold_is_noticed(network, change):
-    watch = Watch(network.modules())
+    changes = ChangeDetector(network.modules())
     change(network)
-    assert not watch.unchanged()
+    assert not changes.unchanged()
 
 
 def test_without_tensors_only_children_and_attributes_count(network):
-    watch = Watch(network.modules(), tensors=False)
+    changes = ChangeDetector(network.modules(), tensors=False)
     network[0].weight = nn.Parameter(th.zeros(4, 3))
-    assert watch.unchanged()
+    assert changes.unchanged()
     network[1] = nn.ReLU()
-    assert not watch.unchanged()
+    assert not changes.unchanged()

@@ -1,4 +1,4 @@
-"""Which weights of a module are kernels."""
+"""Layers whose weights may be sparse."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from torch import nn
 
 from sb3_sparse.errors import UnsupportedError
 
-Kernel = nn.Linear | nn.Conv1d | nn.Conv2d | nn.Conv3d
-KERNEL_TYPES = (nn.Linear, nn.Conv1d, nn.Conv2d, nn.Conv3d)
+Prunable = nn.Linear | nn.Conv1d | nn.Conv2d | nn.Conv3d
+PRUNABLE_TYPES = (nn.Linear, nn.Conv1d, nn.Conv2d, nn.Conv3d)
 UNSUPPORTED_TYPES = (
     nn.RNNBase,
     nn.RNNCellBase,
@@ -21,9 +21,9 @@ UNSUPPORTED_TYPES = (
 )
 
 
-def find_kernels(
+def find_prunable(
     root: nn.Module, prefix: str, stays_dense: Callable[[str], bool]
-) -> Iterator[tuple[str, Kernel]]:
+) -> Iterator[tuple[str, Prunable]]:
     """Every Linear and Conv layer below ``root``, in the order of its modules.
 
     :param root: module to search
@@ -37,7 +37,7 @@ def find_kernels(
                 f"{name} is a {type(module).__name__}, whose weights cannot be made sparse (Linear "
                 f'and Conv layers can); keep it dense with dense_layers=["{name}*"]'
             )
-        if isinstance(module, KERNEL_TYPES):
+        if isinstance(module, PRUNABLE_TYPES):
             check_plain(module, name)
             yield name, module
 
@@ -51,5 +51,5 @@ def check_plain(module: nn.Module, name: str) -> None:
         raise UnsupportedError(
             f"the weight of {name} is computed from other parameters (spectral_norm, weight_norm "
             "or another parametrization), so it cannot be masked; use a plain "
-            f"{type(module).__name__.removeprefix('Parametrized').removeprefix('Compact')}"
+            f"{type(module).__name__.removeprefix('Parametrized').removeprefix('Sparse')}"
         )
