@@ -21,6 +21,7 @@ FLOORS = [
     {"engine"},
     {"topology"},
     {"sparsity"},
+    {"files"},
     {"errors", "lazy"},
 ]
 HEIGHT = {part: -level for level, parts in enumerate(FLOORS) for part in parts}

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from sb3_sparse.engine.network import SparseNetwork
 from sb3_sparse.errors import CorruptStateError, warn
+from sb3_sparse.files import written_whole
 from sb3_sparse.loading.arrays import read_arrays
 from sb3_sparse.loading.guard import reading
 
@@ -75,10 +76,8 @@ class MaskHistory:
         arrays: dict[str, Any] = {f"first/{name}": first for name, first in self.first.items()}
         arrays |= {f"last/{name}": np.packbits(last) for name, last in self.last.items()}
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        new = self.path.with_name(f"{self.path.name}.new")
-        with new.open("wb") as file:
+        with written_whole(self.path) as new, new.open("wb") as file:
             np.savez_compressed(file, timesteps=np.int64(timesteps), **arrays)
-        new.replace(self.path)
 
     def _load(self, path: Path, timesteps: int) -> None:
         what, cure = "history of masks", "remove it, or give another path"

@@ -12,6 +12,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_sparse.analysis.batches import has_batch
 from sb3_sparse.errors import ConfigError, CorruptStateError
+from sb3_sparse.files import write_csv
 from sb3_sparse.loading.guard import reading
 from sb3_sparse.loading.text import read_text
 from sb3_sparse.sparsity.numeric import is_whole
@@ -36,12 +37,7 @@ class MeasurementFile:
         """
         rows = self._rows() if timesteps and self.path.exists() else []
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        new = self.path.with_name(f"{self.path.name}.new")
-        with new.open("w", newline="") as file:
-            writer = csv.writer(file)
-            writer.writerow(HEADS)
-            writer.writerows(row for row in rows if int(row[0]) <= timesteps)
-        new.replace(self.path)
+        write_csv(self.path, HEADS, (row for row in rows if int(row[0]) <= timesteps))
 
     def _rows(self) -> list[list[str]]:
         text = read_text(self.path, "file of measurements", "give another path, or remove it")
@@ -58,7 +54,8 @@ class MeasurementFile:
     def append(self, timesteps: int, values: Mapping[str, float]) -> None:
         """Add a row for each value."""
         with self.path.open("a", newline="") as file:
-            csv.writer(file).writerows((timesteps, name, value) for name, value in values.items())
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerows((timesteps, name, value) for name, value in values.items())
 
 
 class MeasurementCallback(BaseCallback):

@@ -17,6 +17,7 @@ from sb3_sparse.compress.finetune import fill_buffer, fine_tune
 from sb3_sparse.compress.twin import load_beside, sparse_policy, sparsify, sparsity_of
 from sb3_sparse.engine.network import SparseNetwork
 from sb3_sparse.errors import CorruptStateError
+from sb3_sparse.files import written_whole
 from sb3_sparse.loading.guard import reading
 from sb3_sparse.loading.statistics import load_statistics
 
@@ -163,10 +164,8 @@ class Bench:
         normalize = self.model.get_vec_normalize_env()
         if normalize is not None:
             normalize.save(str(normalization))
-        new = path.with_suffix(".new")
-        with new.open("wb") as file:
+        with written_whole(path) as new, new.open("wb") as file:
             self.candidate.save(file)
-        new.replace(path)
 
     def _acting(self, model: BaseAlgorithm) -> SparseNetwork:
         networks = sparse_policy(model).sparse.networks

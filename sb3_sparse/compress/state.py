@@ -14,6 +14,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from sb3_sparse.compress.guard import Interval
 from sb3_sparse.compress.search import Level
 from sb3_sparse.errors import ConfigError, CorruptStateError
+from sb3_sparse.files import written_whole
 from sb3_sparse.loading.guard import reading
 from sb3_sparse.loading.text import read_json
 from sb3_sparse.policies.compiled import unwrapped
@@ -46,9 +47,8 @@ class State:
 
     def save(self, folder: Path) -> None:
         """Write the file, whole or not at all."""
-        new = folder / f"{NAME}.new"
-        new.write_text(json.dumps({"format": FORMAT, **asdict(self)}, indent=1) + "\n")
-        new.replace(folder / NAME)
+        with written_whole(folder / NAME) as new:
+            new.write_text(json.dumps({"format": FORMAT, **asdict(self)}, indent=1) + "\n")
 
 
 def open_state(folder: Path, settings: dict[str, Any]) -> State:

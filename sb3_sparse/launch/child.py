@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from sb3_sparse.files import written_whole
 from sb3_sparse.launch.base import Task
 from sb3_sparse.launch.jobs import Job
 
@@ -38,9 +39,8 @@ def do(job: Job, interrupt: Any) -> None:
     except (Exception, KeyboardInterrupt):
         error = traceback.format_exc()
         print(error, file=sys.stderr)
-    new = job.answer.with_suffix(".new")
-    new.write_bytes(pickle.dumps((value, error)))
-    new.replace(job.answer)
+    with written_whole(job.answer) as new:
+        new.write_bytes(pickle.dumps((value, error)))
 
 
 def _stop(number: int, frame: FrameType | None) -> None:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from statistics import fmean
 from typing import Any
 
@@ -94,12 +92,3 @@ def verdicts_table(verdicts: Sequence[Verdict]) -> Table:
         for v in verdicts
     ]
     return Table(heads, rows)
-
-
-def write_csv(table: Table, path: Path) -> None:
-    """Write a table, numbers with ten digits."""
-    with path.open("w", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(table.heads)
-        for row in table.rows:
-            writer.writerow([f"{v:.10g}" if isinstance(v, float) else v for v in row])

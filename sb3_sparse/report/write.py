@@ -6,11 +6,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from sb3_sparse.errors import ConfigError
+from sb3_sparse.files import write_csv, written_whole
 from sb3_sparse.report.data import read_runs
 from sb3_sparse.report.figures import NotEnoughData, check_figures, draw, save
 from sb3_sparse.report.page import Content, Shown, render
 from sb3_sparse.report.study import Study
-from sb3_sparse.report.tables import cells_table, runs_table, verdicts_table, write_csv
+from sb3_sparse.report.tables import cells_table, runs_table, verdicts_table
 from sb3_sparse.report.verdicts import verdicts
 from sb3_sparse.zoo.archive import Archived
 
@@ -56,12 +57,16 @@ def write_report(
     out.mkdir(parents=True, exist_ok=True)
     shown = [_figure(name, study, out / FOLDER) for name in dict.fromkeys(figures)]
     cells = cells_table(study)
-    write_csv(cells, out / "cells.csv")
-    write_csv(runs_table(study), out / "runs.csv")
-    write_csv(verdicts_table(found), out / "verdicts.csv")
+    for name, table in (
+        ("cells", cells),
+        ("runs", runs_table(study)),
+        ("verdicts", verdicts_table(found)),
+    ):
+        write_csv(out / f"{name}.csv", table.heads, table.rows, digits=10)
     page = out / "index.html"
     content = Content(title, study, cells, found, shown, left_out, tuple(pending), command)
-    page.write_text(render(content), encoding="utf-8")
+    with written_whole(page) as new:
+        new.write_text(render(content), encoding="utf-8")
     return page
 
 

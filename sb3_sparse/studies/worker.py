@@ -5,13 +5,13 @@ What training needs is imported at the top: once for all cells (:mod:`sb3_sparse
 
 from __future__ import annotations
 
-import csv
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from sb3_sparse.errors import ConfigError, Diverged, RunBusy
+from sb3_sparse.files import write_csv
 from sb3_sparse.studies.cell import Cell
 from sb3_sparse.studies.measures import FILES
 from sb3_sparse.studies.status import DONE, OVER, RUNNING, STOPPED, status_of
@@ -101,10 +101,4 @@ def _measure_noise(folder: Path, run: RunSpec, arguments: Mapping[str, Any]) -> 
 
     model, envs = noisy_envs(folder)
     table = noise_robustness(model, envs, **arguments, deterministic=not is_atari(run.env_id))
-    path = folder / FILES["noise"]
-    new = path.with_suffix(".new")
-    with new.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(("sigma", "seed", "episode", "return"))
-        writer.writerows(table.rows())
-    new.replace(path)
+    write_csv(folder / FILES["noise"], ("sigma", "seed", "episode", "return"), table.rows())

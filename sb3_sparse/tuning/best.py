@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 from typing import Any
 
 from sb3_sparse.errors import ConfigError
+from sb3_sparse.files import written_whole
 from sb3_sparse.loading.text import read_text
 from sb3_sparse.tuning.backend import FrozenTrial, optuna
 from sb3_sparse.tuning.objective import VALUES
@@ -62,9 +62,8 @@ def write_best(study: optuna.Study, path: Path) -> Path:
     env_id = definition_of(study).run.env_id
     text = as_yaml({env_id: best_settings(study)})
     path.parent.mkdir(parents=True, exist_ok=True)
-    new = path.with_name(f"{path.name}.new")
-    new.write_text(f"# {describe_best(study)}\n{text}")
-    new.replace(path)
+    with written_whole(path) as new:
+        new.write_text(f"# {describe_best(study)}\n{text}", encoding="utf-8")
     return path
 
 
@@ -96,11 +95,8 @@ def write_into(study: optuna.Study, path: Path) -> None:
     run, settings = definition_of(study).run, best_settings(study)
     check_target(run, path)
     text = merge_entry(_read(path), run.env_id, settings, describe_best(study), TUNED, str(path))
-    target = path.resolve()  # behind a link
-    new = target.with_name(f"{target.name}.new")
-    new.write_text(text, newline="", encoding="utf-8")
-    shutil.copymode(target, new)
-    new.replace(target)
+    with written_whole(path) as new:
+        new.write_text(text, newline="", encoding="utf-8")
 
 
 def _read(path: Path) -> str:

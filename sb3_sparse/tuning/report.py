@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from html import escape
@@ -10,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from sb3_sparse.errors import ConfigError, MissingExtra, SparsityError
+from sb3_sparse.files import write_csv, written_whole
 from sb3_sparse.tuning.backend import BaseStorage, FrozenTrial, TrialState, optuna, quiet_optuna
 from sb3_sparse.tuning.definition import Definition
 from sb3_sparse.tuning.objective import VALUES
@@ -73,7 +73,8 @@ def write_report(studies: Sequence[optuna.Study], storage: BaseStorage, path: Pa
         + "</body></html>\n"
     )
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(page)
+    with written_whole(path) as new:
+        new.write_text(page, encoding="utf-8")
     _write_csv(studies, path.with_suffix(".csv"))
     return path
 
@@ -197,13 +198,12 @@ def _write_csv(studies: Sequence[optuna.Study], path: Path) -> None:
     trials = [(study, trial) for study in studies for trial in status_of(study).all]
     names = sorted({name for _, trial in trials for name in trial.params})
     heads = ["study", "trial", "state", "score", *names, "scores", "evaluations", "seconds"]
-    with path.open("w", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(heads)
-        for study, trial in trials:
-            value = trial.values[0] if trial.state == TrialState.COMPLETE else ""
-            params = [trial.params.get(name, "") for name in names]
-            row = [study.study_name, trial.number, trial.state.name.lower(), value, *params]
-            scores = " ".join(f"{score:.6g}" for score in trial.user_attrs.get("scores", []))
-            seconds = trial.user_attrs.get("seconds", "")
-            writer.writerow([*row, scores, len(trial.intermediate_values), seconds])
+    rows = []
+    for study, trial in trials:
+        value = trial.values[0] if trial.state == TrialState.COMPLETE else ""
+        params = [trial.params.get(name, "") for name in names]
+        row = [study.study_name, trial.number, trial.state.name.lower(), value, *params]
+        scores = " ".join(f"{score:.6g}" for score in trial.user_attrs.get("scores", []))
+        seconds = trial.user_attrs.get("seconds", "")
+        rows.append([*row, scores, len(trial.intermediate_values), seconds])
+    write_csv(path, heads, rows)

@@ -18,6 +18,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_sparse.errors import RunBusy
+from sb3_sparse.files import sync
 from sb3_sparse.zoo.disk import writing
 from sb3_sparse.zoo.divergence import check_networks
 from sb3_sparse.zoo.evaluation import Evaluation
@@ -91,7 +92,7 @@ class Checkpoints(BaseCallback):
             shutil.rmtree(new, ignore_errors=True)
             raise
         new.rename(final)
-        _to_disk(self.parent_folder)
+        sync(self.parent_folder)
         write_record(self.parent_folder.parent, num_timesteps=self.model.num_timesteps)
         for other in self.parent_folder.iterdir():
             if other != final:
@@ -111,7 +112,7 @@ class Checkpoints(BaseCallback):
         self.evaluation.save(new)
         for path in self.parent_folder.parent.glob(f"*{MONITOR}"):
             shutil.copy(path, new / path.name)
-        _to_disk(*new.rglob("*"), new)
+        sync(*new.rglob("*"), new)
 
     @contextmanager
     def on_signals(self) -> Iterator[None]:
@@ -138,18 +139,6 @@ class Checkpoints(BaseCallback):
         finally:
             for number, handler in before.items():
                 signal.signal(number, handler)
-
-
-def _to_disk(*paths: Path) -> None:
-    """Wait until files and folders are on the disk, so that a power cut cannot lose them."""
-    if os.name != "posix":
-        return
-    for path in paths:
-        descriptor = os.open(path, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
 
 
 def last_checkpoint(folder: Path) -> Path | None:

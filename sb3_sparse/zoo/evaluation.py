@@ -15,6 +15,7 @@ from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_sparse.errors import CorruptStateError
+from sb3_sparse.files import written_whole
 from sb3_sparse.loading.arrays import read_arrays
 from sb3_sparse.loading.guard import reading
 from sb3_sparse.loading.text import read_json
@@ -151,9 +152,8 @@ class Evaluation(EvalCallback):
         saved = Evaluated.read(folder)
         for name in (NPZ, BEST):
             if (folder / name).is_file():
-                new = self.folder / f"{name}.new"
-                shutil.copy(folder / name, new)
-                new.replace(self.folder / name)
+                with written_whole(self.folder / name) as new:
+                    shutil.copy(folder / name, new)
             else:
                 (self.folder / name).unlink(missing_ok=True)
         self.best_mean_reward = saved.best_mean_reward

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from sb3_sparse.errors import ConfigError, CorruptStateError
+from sb3_sparse.files import written_whole
 from sb3_sparse.loading.text import read_json
 from sb3_sparse.policies.mixin import SparsePolicyMixin
 
@@ -35,13 +36,8 @@ def write_record(folder: Path, **content: Any) -> None:
     """Write the file, whole or not at all. What it had under other names stays."""
     path = folder / NAME
     known = read_json(path, WHAT, CURE) if path.is_file() else {"format": FORMAT}
-    new = path.with_suffix(".new")
-    try:
+    with written_whole(path) as new:
         new.write_text(json.dumps({**known, **content}, indent=1, default=_plain) + "\n")
-        new.replace(path)
-    except OSError:
-        new.unlink(missing_ok=True)  # half a file on a full disk
-        raise
 
 
 def read_record(folder: Path) -> dict[str, Any]:

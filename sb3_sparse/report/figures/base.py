@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from sb3_sparse.errors import ConfigError
+from sb3_sparse.files import write_csv
 from sb3_sparse.report.backend import (
     Axes,
     EngFormatter,
@@ -185,10 +185,7 @@ def save(name: str, drawing: Drawing, folder: Path) -> None:
     with matplotlib.rc_context(STYLE):
         drawing.figure.savefig(folder / f"{name}.svg", metadata={"Date": None})
         drawing.figure.savefig(folder / f"{name}.png", dpi=150)
-    with (folder / f"{name}.csv").open("w", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(drawing.heads)
-        writer.writerows([map(_plain, row) for row in drawing.rows])
+    write_csv(folder / f"{name}.csv", drawing.heads, drawing.rows, digits=8)
 
 
 def draw(name: str, study: Study) -> Drawing:
@@ -198,9 +195,3 @@ def draw(name: str, study: Study) -> Drawing:
     """
     with matplotlib.rc_context(STYLE):
         return FIGURES[name].draw(study)
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, float):
-        return "" if np.isnan(value) else f"{value:.8g}"
-    return value
