@@ -21,7 +21,7 @@ FLOORS = [
     {"engine"},
     {"topology"},
     {"sparsity"},
-    {"files"},
+    {"files", "pages"},
     {"errors", "lazy"},
 ]
 HEIGHT = {part: -level for level, parts in enumerate(FLOORS) for part in parts}

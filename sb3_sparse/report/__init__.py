@@ -2,8 +2,8 @@
 
 from sb3_sparse.report.data import LeftOut, RunData, read_runs
 from sb3_sparse.report.figures import FIGURES
-from sb3_sparse.report.study import Study
-from sb3_sparse.report.verdicts import FINDINGS, Verdict, verdicts
+from sb3_sparse.report.results import Results
+from sb3_sparse.report.verdicts import FINDINGS, Verdict, judge
 from sb3_sparse.report.write import write_report
 
 __all__ = [
@@ -11,9 +11,9 @@ __all__ = [
     "FINDINGS",
     "LeftOut",
     "RunData",
-    "Study",
+    "Results",
     "Verdict",
+    "judge",
     "read_runs",
-    "verdicts",
     "write_report",
 ]

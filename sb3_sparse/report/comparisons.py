@@ -9,12 +9,9 @@ from dataclasses import dataclass, field
 from statistics import fmean
 
 from sb3_sparse.report.data import RunData
-from sb3_sparse.report.figures.noise import FILE as NOISE_FILE
-from sb3_sparse.report.figures.snr import FILE as SNR_FILE
-from sb3_sparse.report.figures.snr import of_networks
-from sb3_sparse.report.measured import returns_by_sigma, series
+from sb3_sparse.report.measured import NOISE, SNR, returns_by_sigma, snr_by_network
 from sb3_sparse.report.methods import DENSE, EQUAL, percent
-from sb3_sparse.report.study import Study
+from sb3_sparse.report.results import Results
 
 DYNAMIC = ("prune", "set", "rigl")
 SMALL_DECAY, SMALL_SHARE = 1e-4, 0.2
@@ -39,9 +36,9 @@ class Sides:
 Valued = tuple[RunData, float]
 
 
-def sparse_and_equal(study: Study, family: str) -> Sides:
+def sparse_and_equal(results: Results, family: str) -> Sides:
     """Pruning, SET and RigL, and the dense network of as many parameters."""
-    found = _scored(study, (run for run in _main(study, family) if run.level >= 0.5))
+    found = _scored(results, (run for run in _main(results, family) if run.level >= 0.5))
     return _sides(
         [pair for pair in found if pair[0].label in DYNAMIC],
         [pair for pair in found if pair[0].label == EQUAL],
@@ -50,9 +47,9 @@ def sparse_and_equal(study: Study, family: str) -> Sides:
     )
 
 
-def sparse_and_dense(study: Study, family: str) -> Sides:
+def sparse_and_dense(results: Results, family: str) -> Sides:
     """Pruning, SET and RigL at 80 to 90 %, and the dense network of full size."""
-    found = _scored(study, _main(study, family))
+    found = _scored(results, _main(results, family))
     return _sides(
         [
             (run, score)
@@ -65,10 +62,10 @@ def sparse_and_dense(study: Study, family: str) -> Sides:
     )
 
 
-def rigl_and_set(study: Study, family: str) -> Sides:
+def rigl_and_set(results: Results, family: str) -> Sides:
     """RigL and SET at 50 to 95 %."""
-    runs = (run for run in _main(study, family) if 0.5 <= run.level <= 0.95 + CLOSE)
-    found = _scored(study, runs)
+    runs = (run for run in _main(results, family) if 0.5 <= run.level <= 0.95 + CLOSE)
+    found = _scored(results, runs)
     return _sides(
         [pair for pair in found if pair[0].label == "rigl"],
         [pair for pair in found if pair[0].label == "set"],
@@ -77,10 +74,10 @@ def rigl_and_set(study: Study, family: str) -> Sides:
     )
 
 
-def by_distribution(study: Study, family: str) -> Sides:
+def by_distribution(results: Results, family: str) -> Sides:
     """ERK and uniform."""
-    found = _scored(study, _sparse(study, family))
-    kind = {id(run): study.setting(run, "distribution") for run, _ in found}
+    found = _scored(results, _sparse(results, family))
+    kind = {id(run): results.setting(run, "distribution") for run, _ in found}
     return _sides(
         [pair for pair in found if kind[id(pair[0])] == "erk"],
         [pair for pair in found if kind[id(pair[0])] == "uniform"],
@@ -89,9 +86,9 @@ def by_distribution(study: Study, family: str) -> Sides:
     )
 
 
-def by_share(study: Study, family: str) -> Sides:
+def by_share(results: Results, family: str) -> Sides:
     """A small actor and a small critic."""
-    found = _scored(study, _of_family(study, family))
+    found = _scored(results, _of_family(results, family))
     shared = [(run, score, run.actor_share) for run, score in found if run.actor_share is not None]
     return _sides(
         [(run, score) for run, score, share in shared if share <= SMALL_SHARE + CLOSE],
@@ -101,11 +98,11 @@ def by_share(study: Study, family: str) -> Sides:
     )
 
 
-def by_weight_decay(study: Study, family: str) -> Sides:
+def by_weight_decay(results: Results, family: str) -> Sides:
     """A small weight decay and none."""
     found = [
-        (run, score, float(str(study.setting(run, "weight_decay") or 0)))
-        for run, score in _scored(study, _of_family(study, family))
+        (run, score, float(str(results.setting(run, "weight_decay") or 0)))
+        for run, score in _scored(results, _of_family(results, family))
     ]
     return _sides(
         [(run, score) for run, score, decay in found if 0 < decay <= SMALL_DECAY * (1 + 1e-9)],
@@ -115,13 +112,13 @@ def by_weight_decay(study: Study, family: str) -> Sides:
     )
 
 
-def by_snr(study: Study, family: str) -> Sides:
+def by_snr(results: Results, family: str) -> Sides:
     """Log SNR at the highest sparsity and at the lowest, by network."""
-    why = f"no {SNR_FILE} at two sparsities"
+    why = f"no {SNR} at two sparsities"
     found: dict[str, list[tuple[RunData, float]]] = defaultdict(list)
-    for run in _main(study, family):
+    for run in _main(results, family):
         if run.label != EQUAL:
-            for network, points in of_networks(series(run.measured.get(SNR_FILE, ()))).items():
+            for network, points in snr_by_network(run.measured).items():
                 logs = [math.log(value) for _, value in points if value > 0]
                 if logs:
                     found[f"{run.env_id}, {network}"].append((run, fmean(logs)))
@@ -135,40 +132,39 @@ def by_snr(study: Study, family: str) -> Sides:
     return Sides(x, y, why)
 
 
-def by_noise(study: Study, family: str) -> Sides:
+def by_noise(results: Results, family: str) -> Sides:
     """What strong noise costs sparse and parameter-equivalent dense networks."""
     found: list[Valued] = []
-    for run in _main(study, family):
-        by_sigma = returns_by_sigma(run.measured.get(NOISE_FILE, ()))
+    for run in _main(results, family):
+        by_sigma = returns_by_sigma(run.measured)
         strong = [sigma for sigma in by_sigma if sigma > max(by_sigma) / 2]
         if 0.0 in by_sigma and strong:
-            noisy = study.normaliser(run, fmean(by_sigma[sigma] for sigma in strong))
-            quiet = study.normaliser(run, by_sigma[0.0])
+            noisy = results.normaliser(run, fmean(by_sigma[sigma] for sigma in strong))
+            quiet = results.normaliser(run, by_sigma[0.0])
             if noisy is not None and quiet is not None:
                 found.append((run, noisy - quiet))
     return _sides(
         [pair for pair in found if pair[0].label not in (DENSE, EQUAL)],
         [pair for pair in found if pair[0].label == EQUAL],
         _at_level,
-        f"no {NOISE_FILE} with σ = 0 and more of a sparse run beside a parameter-equivalent dense "
-        "one",
+        f"no {NOISE} with σ = 0 and more of a sparse run beside a parameter-equivalent dense one",
     )
 
 
-def _main(study: Study, family: str) -> list[RunData]:
-    return [run for run in study.main if run.family == family]
+def _main(results: Results, family: str) -> list[RunData]:
+    return [run for run in results.main if run.family == family]
 
 
-def _of_family(study: Study, family: str) -> list[RunData]:
-    return [run for run in study.trained if run.family == family]
+def _of_family(results: Results, family: str) -> list[RunData]:
+    return [run for run in results.trained if run.family == family]
 
 
-def _sparse(study: Study, family: str) -> list[RunData]:
-    return [run for run in _of_family(study, family) if run.label not in (DENSE, EQUAL)]
+def _sparse(results: Results, family: str) -> list[RunData]:
+    return [run for run in _of_family(results, family) if run.label not in (DENSE, EQUAL)]
 
 
-def _scored(study: Study, runs: Iterable[RunData]) -> list[Valued]:
-    scored = ((run, study.normaliser(run)) for run in runs)
+def _scored(results: Results, runs: Iterable[RunData]) -> list[Valued]:
+    scored = ((run, results.normaliser(run)) for run in runs)
     return [(run, score) for run, score in scored if score is not None]
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from sb3_sparse.errors import ConfigError
@@ -13,6 +13,9 @@ from sb3_sparse.loading.guard import reading
 from sb3_sparse.loading.text import read_text
 
 Rows = tuple[dict[str, str], ...]
+Points = list[tuple[float, float]]
+SNR, NOISE = "snr.csv", "robustness.csv"
+OF_SNR = "snr/"  # begins the names of its series
 TEXT = "name"
 WHAT = "file of measurements"
 CURE = "remove it, or measure anew"
@@ -56,20 +59,26 @@ def _is_number(text: str | None) -> bool:
         return False
 
 
-def series(rows: Rows) -> dict[str, list[tuple[float, float]]]:
-    """Points ``(timesteps, value)`` by name, in order; what is not a number is no point."""
-    found: dict[str, list[tuple[float, float]]] = {}
-    for row in rows:
-        value = float(row["value"])
-        if not math.isnan(value):
-            found.setdefault(row["name"], []).append((float(row["timesteps"]), value))
-    return {name: sorted(points) for name, points in found.items()}
+def snr_by_network(measured: Mapping[str, Rows]) -> dict[str, Points]:
+    """Return ``(timesteps, SNR)`` over all parameters of each network, active or not.
+
+    :param measured: a run's rows by file name; without a file of ratios there is no network
+    """
+    found: dict[str, Points] = {}
+    for row in measured.get(SNR, ()):
+        network, value = row["name"].removeprefix(OF_SNR), float(row["value"])
+        if network != row["name"] and "/" not in network and not math.isnan(value):
+            found.setdefault(network, []).append((float(row["timesteps"]), value))
+    return {network: sorted(points) for network, points in found.items()}
 
 
-def returns_by_sigma(rows: Rows) -> dict[float, float]:
-    """Mean return over seeds and episodes at each strength of noise."""
+def returns_by_sigma(measured: Mapping[str, Rows]) -> dict[float, float]:
+    """Return the mean return over seeds and episodes at each strength of noise.
+
+    :param measured: a run's rows by file name; without a file of noise there is no strength
+    """
     found: dict[float, list[float]] = {}
-    for row in rows:
+    for row in measured.get(NOISE, ()):
         value = float(row["return"])
         if not math.isnan(value):
             found.setdefault(float(row["sigma"]), []).append(value)

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from html import escape
 
-from sb3_sparse.report import html
+from sb3_sparse.pages import html
+from sb3_sparse.pages.table import Table
 from sb3_sparse.report.data import LeftOut
 from sb3_sparse.report.figures import FIGURES
-from sb3_sparse.report.study import Study
-from sb3_sparse.report.tables import Table, verdicts_table
+from sb3_sparse.report.results import Results
+from sb3_sparse.report.tables import verdicts_table
 from sb3_sparse.report.verdicts import DECIDED, FINDINGS, LEAST_SEEDS, Verdict
 
+CSV_FILES = ("cells.csv", "runs.csv", "verdicts.csv")
 PAPER = "The State of Sparse Training in Deep Reinforcement Learning (arXiv:2206.10369)"
 HOW = (
     "Score of a run: mean over the last 10 % of its evaluations. IQM, probability of improvement "
@@ -22,8 +23,7 @@ HOW = (
     "narrow for few seeds (they cover 75 to 90 % of truths at 3 to 5). Means of one cell: "
     "Student's t; where figures would be all band, the bands are cut at their panel's edge. Where "
     "a cell has runs of several settings, methods are compared by those that change the fewest "
-    "settings "
-    "of their config, then by those with most seeds."
+    "settings of their config, then by those with most seeds."
 )
 INTERVALS = (
     "Effect: difference of the two sides, with a 95 % stratified bootstrap interval, widened for "
@@ -54,7 +54,7 @@ class Content:
     """All that the page says."""
 
     title: str
-    study: Study
+    results: Results
     cells: Table
     verdicts: Sequence[Verdict]
     figures: Sequence[Shown]
@@ -75,7 +75,7 @@ class Content:
 
 def render(content: Content) -> str:
     """The page's HTML."""
-    study = content.study
+    results = content.results
     parts = [
         html.paragraph(_counts(content)),
         html.paragraph(f"Findings are those of {PAPER}."),
@@ -88,26 +88,25 @@ def render(content: Content) -> str:
                 "figures and verdicts that compare methods take these runs."
             ),
             html.table(content.cells),
-            f"<p>{html.link('cells.csv', 'cells.csv')}, {html.link('runs.csv', 'runs.csv')}, "
-            f"{html.link('verdicts.csv', 'verdicts.csv')}</p>",
+            html.paragraph("", *(html.link(name, name) for name in CSV_FILES)),
         ),
-        _normalisation(study),
+        _normalisation(results),
         *_diverged(content),
         _left_out(content),
     ]
     if content.pending or content.command:
         parts.append(_pending(content))
-    parts.append(_versions(study))
+    parts.append(_versions(results))
     return html.page(content.title, parts)
 
 
 def _counts(content: Content) -> str:
-    study = content.study
-    runs = study.trained
-    counted = len(study.runs) - len(runs)
+    results = content.results
+    runs = results.trained
+    counted = len(results.runs) - len(runs)
     steps = sum(run.steps for run in runs)
     seeds = len({run.seed for run in runs})
-    envs = len({run.env_id for run in study.runs})
+    envs = len({run.env_id for run in results.runs})
     also = f", and {counted} only counted" if counted else ""
     return (
         f"Finished runs: {len(runs)}{also}; seeds: {seeds}; environments: {envs}; environment "
@@ -132,27 +131,28 @@ def _figure(shown: Shown) -> str:
     entry = FIGURES[shown.name]
     if shown.svg is None:
         why = "; ".join(shown.remarks)
-        return f"<h3>{escape(entry.title)}</h3>\n" + html.paragraph(f"Left out: {why}.")
-    links = " ".join(
+        return html.subsection(entry.title, html.paragraph(f"Left out: {why}."))
+    links = (
         html.link(f"figures/{shown.name}.{kind}", kind.upper()) for kind in ("png", "svg", "csv")
     )
-    missing = (
-        html.folded("Not in this figure", html.listing(shown.remarks)) if shown.remarks else ""
-    )
-    return (
-        f'<figure id="{escape(shown.name)}"><h3>{escape(entry.title)}</h3>\n'
-        f'<div class="frame">{html.image(shown.svg, f"{entry.title}: {entry.caption}")}</div>\n'
-        f"<figcaption>{escape(entry.caption)} {links}</figcaption>\n{missing}</figure>"
+    missing = [html.folded("Not in this figure", html.listing(shown.remarks))]
+    return html.figure(
+        shown.name,
+        entry.title,
+        html.image(shown.svg, f"{entry.title}: {entry.caption}"),
+        entry.caption,
+        links,
+        *(missing if shown.remarks else ()),
     )
 
 
-def _normalisation(study: Study) -> str:
+def _normalisation(results: Results) -> str:
     parts = [html.paragraph(HOW)]
-    if study.normaliser.scales:
-        parts.append(html.listing(study.normaliser.statements()))
-    if study.normaliser.missing:
+    if results.normaliser.scales:
+        parts.append(html.listing(results.normaliser.statements()))
+    if results.normaliser.missing:
         parts.append(html.paragraph("Without a scale, so in no figure of normalised scores:"))
-        parts.append(html.listing(study.normaliser.missing))
+        parts.append(html.listing(results.normaliser.missing))
     parts.append(
         html.paragraph(
             "Scales: Atari by random play and human testers of Mnih et al. 2015; classic control "
@@ -178,10 +178,10 @@ def _diverged(content: Content) -> list[str]:
 def _left_out(content: Content) -> str:
     texts = [f"{one.folder}: {one.reason}" for one in content.others]
     parts = [html.listing(texts) if texts else html.paragraph("No run folder was left out.")]
-    if content.study.remarks:
+    if content.results.remarks:
         parts += [
             html.paragraph("Cells with runs of several settings:"),
-            html.listing(content.study.remarks),
+            html.listing(content.results.remarks),
         ]
     return html.section("Left out", *parts)
 
@@ -195,9 +195,9 @@ def _pending(content: Content) -> str:
     return html.section("Pending", *parts)
 
 
-def _versions(study: Study) -> str:
+def _versions(results: Results) -> str:
     found: dict[str, set[str]] = {}
-    for run in study.runs:
+    for run in results.runs:
         versions = run.record.get("versions")
         for name, version in (versions if isinstance(versions, Mapping) else {}).items():
             found.setdefault(str(name), set()).add(str(version))

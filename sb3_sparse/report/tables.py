@@ -1,57 +1,51 @@
-"""Tables of a report: cells, runs and verdicts, as rows for the page and for CSV files."""
+"""The tables of a report: cells, runs and verdicts."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from statistics import fmean
 from typing import Any
 
 import numpy as np
 
+from sb3_sparse.pages.table import Table
 from sb3_sparse.report.data import RunData
 from sb3_sparse.report.methods import DENSE, EQUAL, name_of
+from sb3_sparse.report.results import Results, cell_of, grouped
 from sb3_sparse.report.statistics import LEAST, iqm, iqm_estimates
-from sb3_sparse.report.study import Study, cell_of, grouped
-from sb3_sparse.report.verdicts import Verdict
+from sb3_sparse.report.verdicts import CONTRADICTED, SUPPORTED, UNDECIDED, Verdict
+
+MARKS = {SUPPORTED: "good", CONTRADICTED: "bad", UNDECIDED: "open"}
 
 
-@dataclass(frozen=True)
-class Table:
-    """Heads and rows; None is an empty cell."""
-
-    heads: Sequence[str]
-    rows: Sequence[Sequence[Any]]
-
-
-def cells_table(study: Study) -> Table:
-    """A row for each family, environment, method, sparsity and variant of settings."""
+def cells_table(results: Results) -> Table:
+    """Return a row for each family, environment, method, sparsity and variant of settings."""
     heads = ["family", "environment", "method", "sparsity", "distribution", "settings", "compared"]
-    if study.varies:
-        heads.append(study.varies)
+    if results.varies:
+        heads.append(results.varies)
     heads += ["seeds", "mean score", "std", "IQM", "low", "high", "normalised mean"]
     rows = []
-    main = {id(run) for run in study.main}
-    for _, members in sorted(grouped(study.runs, cell_of).items()):
+    main = {id(run) for run in results.main}
+    for _, members in sorted(grouped(results.runs, cell_of).items()):
         variants: dict[str, list[RunData]] = {}
         for run in members:
             variants.setdefault(f"{run.trained}{run.variant()}", []).append(run)
         for number, runs in enumerate(variants.values(), start=1):
-            rows.append(_cell(study, runs, f"{number} of {len(variants)}", id(runs[0]) in main))
+            rows.append(_cell(results, runs, f"{number} of {len(variants)}", id(runs[0]) in main))
     return Table([*heads, "parameters", "FLOPs", "FLOPs of dense"], rows)
 
 
-def _cell(study: Study, runs: list[RunData], number: str, compared: bool) -> list[Any]:
+def _cell(results: Results, runs: list[RunData], number: str, compared: bool) -> list[Any]:
     first = runs[0]
     dense = first.label in (DENSE, EQUAL)
     row: list[Any] = [first.family, first.env_id, name_of(first.label), first.level]
-    row += [None if dense else study.setting(first, "distribution"), number]
+    row += [None if dense else results.setting(first, "distribution"), number]
     row.append("yes" if compared else "no" if first.trained else "counted only")
-    if study.varies:
-        row.append(str(study.setting(first, study.varies)))
+    if results.varies:
+        row.append(str(results.setting(first, results.varies)))
     if first.trained:
         scores = np.array([run.score for run in runs])
-        known = [x for run in runs if (x := study.normaliser(run)) is not None]
+        known = [x for run in runs if (x := results.normaliser(run)) is not None]
         row += [len(runs), float(scores.mean())]
         if len(runs) >= LEAST:
             estimate = iqm_estimates({"": scores[:, None]})[""]
@@ -65,25 +59,25 @@ def _cell(study: Study, runs: list[RunData], number: str, compared: bool) -> lis
     return [*row, *map(round, means), first.dense_flops]
 
 
-def runs_table(study: Study) -> Table:
-    """A row a run."""
+def runs_table(results: Results) -> Table:
+    """Return a row for each run."""
     heads = ["folder", "algorithm", "environment", "method", "sparsity", "distribution", "seed"]
     heads += ["status", "timesteps", "evaluations", "score", "normalised", "parameters", "flops"]
     heads += ["dense flops", "compared"]
-    main = {id(run) for run in study.main}
+    main = {id(run) for run in results.main}
     rows = []
-    for run in sorted(study.runs, key=lambda run: (*cell_of(run), run.seed, str(run.folder))):
+    for run in sorted(results.runs, key=lambda run: (*cell_of(run), run.seed, str(run.folder))):
         row: list[Any] = [str(run.folder), run.algo, run.env_id, run.label, run.level]
-        row += [study.setting(run, "distribution"), run.seed, run.record["status"], run.steps]
+        row += [results.setting(run, "distribution"), run.seed, run.record["status"], run.steps]
         row += [len(run.returns), run.score if run.trained else None]
-        row.append(study.normaliser(run) if run.trained else None)
+        row.append(results.normaliser(run) if run.trained else None)
         row += [run.parameters, run.flops, run.dense_flops, "yes" if id(run) in main else "no"]
         rows.append(row)
     return Table(heads, rows)
 
 
 def verdicts_table(verdicts: Sequence[Verdict]) -> Table:
-    """A row a verdict."""
+    """Return a row for each verdict."""
     heads = ["finding of the paper", "verdict", "effect", "low", "high", "of", "seeds", "strata"]
     heads += ["runs of", "remark"]
     rows = [
@@ -91,4 +85,4 @@ def verdicts_table(verdicts: Sequence[Verdict]) -> Table:
         + [v.seeds, v.strata, v.family or None, v.remark]
         for v in verdicts
     ]
-    return Table(heads, rows)
+    return Table(heads, rows, marks=MARKS)

@@ -17,8 +17,8 @@ from sb3_sparse.report.comparisons import (
     sparse_and_equal,
 )
 from sb3_sparse.report.data import Array
+from sb3_sparse.report.results import Results
 from sb3_sparse.report.statistics import difference, iqm, rectangle
-from sb3_sparse.report.study import Study
 
 SUPPORTED, CONTRADICTED, UNDECIDED = "supported", "contradicted", "not enough data"
 LEAST_SEEDS = 3
@@ -41,7 +41,7 @@ class Finding:
     key: str
     text: str
     rule: str
-    sides: Callable[[Study, str], Sides]
+    sides: Callable[[Results, str], Sides]
     decide: str
     statistic: Callable[[Array], float]
     unit: str
@@ -144,11 +144,14 @@ FINDINGS = (
 )  # fmt: skip
 
 
-def verdicts(study: Study) -> list[Verdict]:
-    """One for each finding and family with runs for it; "not enough data" where none has."""
+def judge(results: Results) -> list[Verdict]:
+    """Judge each finding by each family of runs that has data on it.
+
+    A finding without data has one verdict, "not enough data", that says what is missing.
+    """
     found = []
     for finding in FINDINGS:
-        given = [(family, finding.sides(study, family)) for family in study.families()]
+        given = [(family, finding.sides(results, family)) for family in results.families()]
         known = [(family, sides) for family, sides in given if sides.x]
         if not known:
             why = "; ".join(dict.fromkeys(sides.why for _, sides in given)) or "no trained run"

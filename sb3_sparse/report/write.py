@@ -9,10 +9,10 @@ from sb3_sparse.errors import ConfigError
 from sb3_sparse.files import write_csv, written_whole
 from sb3_sparse.report.data import read_runs
 from sb3_sparse.report.figures import NotEnoughData, check_figures, draw, save
-from sb3_sparse.report.page import Content, Shown, render
-from sb3_sparse.report.study import Study
+from sb3_sparse.report.page import CSV_FILES, Content, Shown, render
+from sb3_sparse.report.results import Results
 from sb3_sparse.report.tables import cells_table, runs_table, verdicts_table
-from sb3_sparse.report.verdicts import verdicts
+from sb3_sparse.report.verdicts import judge
 from sb3_sparse.zoo.archive import Archived
 
 FOLDER = "figures"
@@ -52,27 +52,24 @@ def write_report(
     if out.exists() and not out.is_dir():
         raise ConfigError(f"the report goes into a folder, and {out} is a file; give another name")
     runs, left_out = read_runs(folders, archived)
-    study = Study(tuple(runs), varies)
-    found = verdicts(study)
+    results = Results(tuple(runs), varies)
+    found = judge(results)
     out.mkdir(parents=True, exist_ok=True)
-    shown = [_figure(name, study, out / FOLDER) for name in dict.fromkeys(figures)]
-    cells = cells_table(study)
-    for name, table in (
-        ("cells", cells),
-        ("runs", runs_table(study)),
-        ("verdicts", verdicts_table(found)),
-    ):
-        write_csv(out / f"{name}.csv", table.heads, table.rows, digits=10)
+    shown = [_figure(name, results, out / FOLDER) for name in dict.fromkeys(figures)]
+    cells = cells_table(results)
+    tables = (cells, runs_table(results), verdicts_table(found))
+    for name, table in zip(CSV_FILES, tables, strict=True):
+        write_csv(out / name, table.heads, table.rows, digits=10)
     page = out / "index.html"
-    content = Content(title, study, cells, found, shown, left_out, tuple(pending), command)
+    content = Content(title, results, cells, found, shown, left_out, tuple(pending), command)
     with written_whole(page) as new:
         new.write_text(render(content), encoding="utf-8")
     return page
 
 
-def _figure(name: str, study: Study, folder: Path) -> Shown:
+def _figure(name: str, results: Results, folder: Path) -> Shown:
     try:
-        drawing = draw(name, study)
+        drawing = draw(name, results)
     except NotEnoughData as error:
         return _kept(name, folder, str(error))
     save(name, drawing, folder)

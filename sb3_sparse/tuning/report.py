@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterable, Sequence
-from html import escape
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from sb3_sparse.errors import ConfigError, MissingExtra, SparsityError
 from sb3_sparse.files import write_csv, written_whole
+from sb3_sparse.pages import html
+from sb3_sparse.pages.table import Table
 from sb3_sparse.tuning.backend import BaseStorage, FrozenTrial, TrialState, optuna, quiet_optuna
 from sb3_sparse.tuning.definition import Definition
 from sb3_sparse.tuning.objective import VALUES
@@ -32,12 +33,7 @@ except ImportError as error:
 
 TOP = 10
 HEIGHT = 420
-STYLE = """
-body { font: 16px/1.5 system-ui, sans-serif; margin: 0 auto; max-width: 70rem; padding: 1rem; }
-table { border-collapse: collapse; display: block; overflow-x: auto; font-size: .9rem; }
-td, th { border-bottom: 1px solid #ccc; padding: .25rem .75rem; text-align: left; }
-td.number { text-align: right; font-variant-numeric: tabular-nums; }
-"""
+DIGITS = 6
 FIGURES: dict[str, Callable[[optuna.Study], Any]] = {
     "Optimization history": plot_optimization_history,
     "Parameter importances": plot_param_importances,
@@ -62,16 +58,9 @@ def write_report(studies: Sequence[optuna.Study], storage: BaseStorage, path: Pa
             raise ConfigError(
                 f"no trial of {study.study_name!r} was completed yet, so there is nothing to report"
             )
-    parts = [part for study in studies for part in _about(study)]
     title = "Tuning: " + ", ".join(study.study_name for study in studies)
-    page = (
-        f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
-        f'<meta name="viewport" content="width=device-width"><title>{escape(title)}</title>'
-        f"<style>{STYLE}</style><script>{plotly.offline.get_plotlyjs()}</script></head>"
-        f"<body><h1>{escape(title)}</h1>\n{_best_by_method(studies, storage)}\n"
-        + "\n".join(parts)
-        + "</body></html>\n"
-    )
+    parts = [_best_by_method(studies, storage), *map(_about, studies)]
+    page = html.page(title, parts, script=plotly.offline.get_plotlyjs())
     path.parent.mkdir(parents=True, exist_ok=True)
     with written_whole(path) as new:
         new.write_text(page, encoding="utf-8")
@@ -97,7 +86,7 @@ def report_on(
     return write_report(studies, opened, path or folder / "report.html")
 
 
-def _about(study: optuna.Study) -> list[str]:
+def _about(study: optuna.Study) -> str:
     definition, status = definition_of(study), status_of(study)
     pruned = len(status.done) - len(status.complete)
     run = definition.run
@@ -108,24 +97,25 @@ def _about(study: optuna.Study) -> list[str]:
         f"{len(status.complete)} completed, {pruned} pruned, {len(status.failed)} failed, of "
         f"{status.planned} planned",
     ]
-    parts = [f"<h2>{escape(study.study_name)}</h2>", f"<p>{escape('; '.join(facts))}.</p>"]
-    parts += [f"<h3>The {TOP} best trials</h3>", _top(status.complete)]
-    for title, draw in FIGURES.items():
-        parts += [f"<h3>{title}</h3>", _figure(draw, study)]
-    return parts
+    return html.section(
+        study.study_name,
+        html.paragraph(f"{'; '.join(facts)}."),
+        html.subsection(f"The {TOP} best trials", _top(status.complete)),
+        *(html.subsection(title, *_figure(draw, study)) for title, draw in FIGURES.items()),
+    )
 
 
-def _figure(draw: Callable[[optuna.Study], Any], study: optuna.Study) -> str:
+def _figure(draw: Callable[[optuna.Study], Any], study: optuna.Study) -> list[str]:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
             figure = draw(study)
         except (ValueError, RuntimeError) as error:
-            return f"<p>Not to be had from these trials: {escape(str(error))}</p>"
+            return [html.paragraph(f"These trials do not give it: {error}")]
     said = [w for w in caught if w.category is UserWarning]
     figure.update_layout(height=HEIGHT, title=None, margin={"t": 30})
-    html: str = plotly.io.to_html(figure, full_html=False, include_plotlyjs=False)
-    return html + "".join(f"<p>Optuna says: {escape(str(w.message))}</p>" for w in said)
+    picture = plotly.io.to_html(figure, full_html=False, include_plotlyjs=False)
+    return [html.frame(picture), *(html.paragraph(f"Optuna says: {w.message}") for w in said)]
 
 
 def _what(definition: Definition, best: FrozenTrial | None) -> str:
@@ -142,10 +132,10 @@ def _top(trials: Sequence[FrozenTrial]) -> str:
     best = sorted(trials, key=lambda trial: -trial.values[0])[:TOP]
     names = sorted({name for trial in best for name in trial.params})
     rows = [
-        [trial.number, trial.values[0], _scores(trial), *(trial.params.get(n, "") for n in names)]
+        [trial.number, trial.values[0], _scores(trial), *(trial.params.get(n) for n in names)]
         for trial in best
     ]
-    return _table(["trial", "score", "score of each seed", *names], rows)
+    return html.table(Table(["trial", "score", "score of each seed", *names], rows, DIGITS))
 
 
 def _scores(trial: FrozenTrial) -> str:
@@ -154,7 +144,7 @@ def _scores(trial: FrozenTrial) -> str:
 
 def _best_by_method(studies: Sequence[optuna.Study], storage: BaseStorage) -> str:
     tasks = {_task(definition_of(study)) for study in studies}
-    rows, unread = [], ""
+    rows, unread = [], []
     for summary in storage.get_all_studies():
         if DEFINITION not in summary.user_attrs:
             continue
@@ -162,7 +152,7 @@ def _best_by_method(studies: Sequence[optuna.Study], storage: BaseStorage) -> st
         try:
             definition, status = definition_of(study), status_of(study)
         except SparsityError as error:  # e.g. of an environment or method that is not here
-            unread += f"<p>Left out: {escape(f'{summary.study_name}: {error}')}</p>\n"
+            unread.append(html.paragraph(f"Left out: {summary.study_name}: {error}"))
             continue
         if _task(definition) not in tasks or status.best is None:
             continue
@@ -172,25 +162,13 @@ def _best_by_method(studies: Sequence[optuna.Study], storage: BaseStorage) -> st
         row += [shown, f"{len(status.complete)} of {status.planned}", definition.seeds]
         rows.append([*row, study.study_name])
     heads = ["algorithm", "environment", "steps", "method", "best score", "with", "completed"]
-    table = _table([*heads, "seeds a trial", "study"], sorted(rows, key=str))
-    return f"<h2>Best of each method</h2>\n{table}\n{unread}"
+    table = Table([*heads, "seeds a trial", "study"], sorted(rows, key=str), DIGITS)
+    return html.section("Best of each method", html.table(table), *unread)
 
 
 def _task(definition: Definition) -> tuple[str, str, int]:
     run = definition.run
     return run.algo, run.env_id, run.settings()["n_timesteps"]
-
-
-def _table(heads: Iterable[str], rows: Iterable[Iterable[Any]]) -> str:
-    head = "".join(f"<th>{escape(text)}</th>" for text in heads)
-    body = "".join(f"<tr>{''.join(map(_cell, row))}</tr>\n" for row in rows)
-    return f"<table><thead><tr>{head}</tr></thead>\n<tbody>{body}</tbody></table>"
-
-
-def _cell(value: Any) -> str:
-    if isinstance(value, float):
-        return f'<td class="number">{value:.6g}</td>'
-    return f"<td>{escape(str(value))}</td>"
 
 
 def _write_csv(studies: Sequence[optuna.Study], path: Path) -> None:
@@ -200,10 +178,10 @@ def _write_csv(studies: Sequence[optuna.Study], path: Path) -> None:
     heads = ["study", "trial", "state", "score", *names, "scores", "evaluations", "seconds"]
     rows = []
     for study, trial in trials:
-        value = trial.values[0] if trial.state == TrialState.COMPLETE else ""
-        params = [trial.params.get(name, "") for name in names]
+        value = trial.values[0] if trial.state == TrialState.COMPLETE else None
+        params = [trial.params.get(name) for name in names]
         row = [study.study_name, trial.number, trial.state.name.lower(), value, *params]
         scores = " ".join(f"{score:.6g}" for score in trial.user_attrs.get("scores", []))
-        seconds = trial.user_attrs.get("seconds", "")
+        seconds = trial.user_attrs.get("seconds")
         rows.append([*row, scores, len(trial.intermediate_values), seconds])
     write_csv(path, heads, rows)

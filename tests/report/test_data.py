@@ -9,7 +9,7 @@ import pytest
 from sb3_sparse.report import read_runs
 from sb3_sparse.report.figures.curves import aligned
 from sb3_sparse.report.normalisation import HUMAN, Normaliser
-from sb3_sparse.report.study import Study
+from sb3_sparse.report.results import Results
 
 
 def reasons(folders):
@@ -157,10 +157,10 @@ def test_no_two_settings_are_averaged_and_the_least_changed_compares(folders):
         folders.add(
             seed=seed, score=0.0, policy={"weight_decay": 0.1}, overrides={"weight_decay": 0.1}
         )
-    study = Study(tuple(read_runs(folders.made)[0]))
-    cell = study.cell("DQN on classic control", "CartPole-v1", "rigl", 0.9)
+    results = Results(tuple(read_runs(folders.made)[0]))
+    cell = results.cell("DQN on classic control", "CartPole-v1", "rigl", 0.9)
     assert [run.score for run in cell] == [100.0, 100.0]
-    assert "2 variants" in study.remarks[0]
+    assert "2 variants" in results.remarks[0]
 
 
 # DQN's scores and percentages of the human tester, of the same table of Mnih et al. 2015: an
@@ -214,4 +214,4 @@ def test_a_damaged_model_is_named_by_the_figure_of_masks(folders):
     with zipfile.ZipFile(folder / "CartPole-v1.zip", "w") as file:
         file.writestr("policy.pth", b"nothing")
     with pytest.raises(NotEnoughData, match="cannot be read"):
-        draw("masks", Study(tuple(read_runs([folder])[0])))
+        draw("masks", Results(tuple(read_runs([folder])[0])))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sb3_sparse.report import FINDINGS, Study, read_runs, verdicts
+from sb3_sparse.report import FINDINGS, Results, judge, read_runs
 
 SUPPORTED, CONTRADICTED, UNDECIDED = "supported", "contradicted", "not enough data"
 
@@ -13,7 +13,7 @@ SUPPORTED, CONTRADICTED, UNDECIDED = "supported", "contradicted", "not enough da
 def verdict(folders, key):
     runs, out = read_runs(folders.made)
     assert not out
-    found = [one for one in verdicts(Study(tuple(runs))) if one.finding.key == key]
+    found = [one for one in judge(Results(tuple(runs))) if one.finding.key == key]
     assert len(found) == 1
     return found[0]
 

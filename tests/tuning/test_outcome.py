@@ -188,8 +188,8 @@ def test_the_page_and_its_csv(study, storage, tmp_path):
     table = page[page.index("Best of each method") : page.index("<h2>mine</h2>")]
     rows = re.findall(r"<tr><td>dqn.*?</tr>", table)
     assert len(rows) == 2
-    assert '<td>rigl at 90%</td><td class="number">99</td>' in rows[0]
-    assert '<td>static at 90%</td><td class="number">-1</td>' in rows[1]
+    assert '<td>rigl at 90%</td><td class="number" data-value="99.0">99</td>' in rows[0]
+    assert '<td>static at 90%</td><td class="number" data-value="-1.0">-1</td>' in rows[1]
 
     with (tmp_path / "page.csv").open() as file:
         trials = list(csv.DictReader(file))

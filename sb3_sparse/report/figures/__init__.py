@@ -20,6 +20,6 @@ from sb3_sparse.report.figures.base import (
     draw,
     save,
 )
-from sb3_sparse.report.study import NotEnoughData
+from sb3_sparse.report.results import NotEnoughData
 
 __all__ = ["FIGURES", "Drawing", "NotEnoughData", "check_figures", "draw", "save"]

@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 from sb3_sparse.report.figures.base import Drawing, figure, panels
-from sb3_sparse.report.methods import look_of, name_of, percent
+from sb3_sparse.report.methods import look_of, name_of
+from sb3_sparse.report.results import Results
 from sb3_sparse.report.scores import panels_of
 from sb3_sparse.report.statistics import iqm_estimates
-from sb3_sparse.report.study import Study
 
 HEADS = ("family", "sparsity", "method", "iqm", "low", "high", "seeds", "tasks")
 
@@ -19,13 +19,13 @@ HEADS = ("family", "sparsity", "method", "iqm", "low", "high", "seeds", "tasks")
     "Mean of the middle half of normalised scores over runs and tasks, with 95 % stratified "
     "bootstrap intervals (rliable); a panel for each sparsity.",
 )
-def draw(study: Study) -> Drawing:
+def draw(results: Results) -> Drawing:
     """A panel a sparsity, an interval a method."""
-    found, remarks = panels_of(study)
+    found, remarks = panels_of(results)
     made, axes = panels(len(found))
     rows: list[list[Any]] = []
-    for one, (family, level, scores, tasks) in zip(axes, found, strict=True):
-        estimates = iqm_estimates(scores)
+    for one, panel in zip(axes, found, strict=True):
+        estimates = iqm_estimates(panel.scores)
         for place, (label, estimate) in enumerate(estimates.items()):
             look = look_of(label)
             ends = [estimate.low, estimate.high]
@@ -33,10 +33,12 @@ def draw(study: Study) -> Drawing:
                      solid_capstyle="butt")  # fmt: skip
             one.plot(estimate.value, place, look.marker, color=look.color, markersize=7)
             low, high, value = estimate.low, estimate.high, estimate.value
-            rows.append([family, level, label, value, low, high, estimate.seeds, estimate.tasks])
+            rows.append(
+                [panel.family, panel.level, label, value, low, high, estimate.seeds, estimate.tasks]
+            )
         one.set_yticks(range(len(estimates)), [name_of(label) for label in estimates])
         one.invert_yaxis()
         one.margins(x=0.08, y=0.12)
-        one.set_title(f"{family}\n{percent(level)}, {len(tasks)} task(s)")
+        one.set_title(panel.title)
         one.set_xlabel("IQM of normalised scores")
     return Drawing(made, HEADS, rows, remarks)

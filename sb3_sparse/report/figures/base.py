@@ -21,8 +21,8 @@ from sb3_sparse.report.backend import (
 )
 from sb3_sparse.report.data import Array
 from sb3_sparse.report.methods import Look
+from sb3_sparse.report.results import Results
 from sb3_sparse.report.statistics import Estimate
-from sb3_sparse.report.study import Study
 
 WIDTH, HEIGHT, COLUMNS = 3.4, 2.7, 3
 SPARE = 0.5
@@ -61,7 +61,7 @@ class Drawing:
     remarks: Sequence[str] = field(default_factory=list)
 
 
-Draw = Callable[[Study], Drawing]
+Draw = Callable[[Results], Drawing]
 DrawT = TypeVar("DrawT", bound=Draw)
 
 
@@ -188,10 +188,10 @@ def save(name: str, drawing: Drawing, folder: Path) -> None:
     write_csv(folder / f"{name}.csv", drawing.heads, drawing.rows, digits=8)
 
 
-def draw(name: str, study: Study) -> Drawing:
+def draw(name: str, results: Results) -> Drawing:
     """Draw one figure in the house's style.
 
     :raises NotEnoughData: if these runs do not give it
     """
     with matplotlib.rc_context(STYLE):
-        return FIGURES[name].draw(study)
+        return FIGURES[name].draw(results)

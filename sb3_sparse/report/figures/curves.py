@@ -11,8 +11,8 @@ import numpy as np
 from sb3_sparse.report.data import Array, RunData
 from sb3_sparse.report.figures.base import Drawing, figure, legend, line, panels
 from sb3_sparse.report.methods import DENSE, look_of, name_of, percent
+from sb3_sparse.report.results import NotEnoughData, Results
 from sb3_sparse.report.statistics import means
-from sb3_sparse.report.study import NotEnoughData, Study
 
 HEADS = ("family", "environment", "sparsity", "method", "timesteps", "mean", "low", "high", "seeds")
 
@@ -23,17 +23,17 @@ HEADS = ("family", "environment", "sparsity", "method", "timesteps", "mean", "lo
     "Mean return of the evaluations during training over seeds, with pointwise 95 % Student t "
     "intervals (no band for one seed); a panel for each environment and sparsity.",
 )
-def draw(study: Study) -> Drawing:
+def draw(results: Results) -> Drawing:
     """A panel for each environment and sparsity, a line a method."""
     places = [
         (family, env_id, level)
-        for family in study.families()
-        for env_id in study.envs(family)
-        for level in study.levels(family) or [0.0]
+        for family in results.families()
+        for env_id in results.envs(family)
+        for level in results.levels(family) or [0.0]
         if any(
-            study.cell(family, env_id, label, level)
-            for label in study.labels(family, level)
-            if label != DENSE or not study.levels(family)
+            results.cell(family, env_id, label, level)
+            for label in results.labels(family, level)
+            if label != DENSE or not results.levels(family)
         )
     ]
     if not places:
@@ -42,8 +42,8 @@ def draw(study: Study) -> Drawing:
     rows: list[list[Any]] = []
     remarks: list[str] = []
     for one, (family, env_id, level) in zip(axes, places, strict=True):
-        for label in study.labels(family, level):
-            runs = study.cell(family, env_id, label, level)
+        for label in results.labels(family, level):
+            runs = results.cell(family, env_id, label, level)
             if not runs:
                 continue
             steps, values, said = aligned(runs)

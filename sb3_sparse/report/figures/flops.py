@@ -7,7 +7,7 @@ from typing import Any
 from sb3_sparse.report.backend import PercentFormatter
 from sb3_sparse.report.figures.base import Drawing, figure, legend, panels
 from sb3_sparse.report.methods import DENSE, EQUAL
-from sb3_sparse.report.study import NotEnoughData, Study
+from sb3_sparse.report.results import NotEnoughData, Results
 
 HEADS = ("family", "environment", "distribution", "sparsity", "flops", "dense flops", "share")
 NAMES = {"erk": "ERK", "er": "ER"}
@@ -24,12 +24,12 @@ DRAWN = {
     "Floating-point operations of one forward pass of all networks, as a share of the dense "
     "network's, against sparsity; counted from the layers, trained or not.",
 )
-def draw(study: Study) -> Drawing:
+def draw(results: Results) -> Drawing:
     """A panel an architecture, a line a distribution."""
     found: dict[tuple[str, str], dict[str, dict[float, tuple[int, int]]]] = {}
-    for run in study.runs:
+    for run in results.runs:
         if run.label not in (DENSE, EQUAL) and run.dense_flops:
-            kind = str(study.setting(run, "distribution"))
+            kind = str(results.setting(run, "distribution"))
             counted = found.setdefault((run.family, run.env_id), {}).setdefault(kind, {})
             counted.setdefault(run.level, (run.flops, run.dense_flops))
     if not found:

@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 from sb3_sparse.report.figures.base import Drawing, figure, panels
-from sb3_sparse.report.methods import DENSE, EQUAL, look_of, name_of, percent
+from sb3_sparse.report.methods import DENSE, EQUAL, look_of, name_of
+from sb3_sparse.report.results import NotEnoughData, Results
 from sb3_sparse.report.scores import panels_of
 from sb3_sparse.report.statistics import improvement
-from sb3_sparse.report.study import NotEnoughData, Study
 
 HEADS = ("family", "sparsity", "method", "against", "probability", "low", "high", "seeds", "tasks")
 SHORT = {DENSE: "dense 100 %", EQUAL: "equal dense"}
@@ -21,31 +21,30 @@ SHORT = {DENSE: "dense 100 %", EQUAL: "equal dense"}
     "task, mean over tasks, ties counted half, with 95 % stratified bootstrap intervals (rliable). "
     "The vertical line is no difference.",
 )
-def draw(study: Study) -> Drawing:
+def draw(results: Results) -> Drawing:
     """Sparse methods against both dense networks, and RigL against SET."""
-    found, remarks = panels_of(study)
-    paired = [(*one, pairs) for one in found if (pairs := _pairs(list(one[2])))]
+    found, remarks = panels_of(results)
+    paired = [(panel, pairs) for panel in found if (pairs := _pairs(list(panel.scores)))]
     if not paired:
         raise NotEnoughData("no sparsity has two methods to compare")
-    most = max(len(pairs) for *_, pairs in paired)
+    most = max(len(pairs) for _, pairs in paired)
     made, axes = panels(len(paired), height=1.2 + 0.26 * most)
     rows: list[list[Any]] = []
-    for one, (family, level, scores, tasks, pairs) in zip(axes, paired, strict=True):
+    for one, (panel, pairs) in zip(axes, paired, strict=True):
         for place, (better, worse) in enumerate(pairs):
-            estimate = improvement(scores[better], scores[worse])
+            estimate = improvement(panel.scores[better], panel.scores[worse])
             value, low, high = estimate.value, estimate.low, estimate.high
             look = look_of(better)
             one.plot([low, high], [place, place], color=look.color, linewidth=4, alpha=0.4)
             one.plot(value, place, look.marker, color=look.color, markersize=6)
-            rows.append(
-                [family, level, better, worse, value, low, high, estimate.seeds, len(tasks)]
-            )
+            row: list[Any] = [panel.family, panel.level, better, worse, value, low, high]
+            rows.append([*row, estimate.seeds, len(panel.tasks)])
         one.axvline(0.5, color="#444444", linewidth=0.8)
         one.set_xlim(-0.06, 1.06)
         texts = [f"{name_of(a)} > {SHORT.get(b, name_of(b))}" for a, b in pairs]
         one.set_yticks(range(len(pairs)), texts)
         one.invert_yaxis()
-        one.set_title(f"{family}\n{percent(level)}, {len(tasks)} task(s)")
+        one.set_title(panel.title)
         one.set_xlabel("probability")
     return Drawing(made, HEADS, rows, remarks)
 

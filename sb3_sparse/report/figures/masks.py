@@ -14,7 +14,7 @@ from sb3_sparse.report.backend import MaxNLocator
 from sb3_sparse.report.data import Array, RunData
 from sb3_sparse.report.figures.base import Drawing, figure, panels
 from sb3_sparse.report.methods import name_of, percent
-from sb3_sparse.report.study import NotEnoughData, Study
+from sb3_sparse.report.results import NotEnoughData, Results
 
 HEADS = ("run", "method", "sparsity", "layer", "shape", "block row", "densities of the blocks")
 BLOCKS, LAYERS, CLOSE_TO = 128, 4, 0.9
@@ -28,11 +28,11 @@ ORDER = ("rigl", "set", "prune", "static")
     "most 128 by 128 blocks: black is all active, white none. One run a method, at the sparsity "
     "closest to 90 %; the first layers, of which the first reads the observation.",
 )
-def draw(study: Study) -> Drawing:
+def draw(results: Results) -> Drawing:
     """A row a method, a panel a layer."""
     remarks: list[str] = []
     shown: list[tuple[RunData, list[tuple[str, tuple[int, ...], Array]]]] = []
-    for run in _chosen(study):
+    for run in _chosen(results):
         try:
             masks = masks_of(run)
         except SparsityError as error:
@@ -70,9 +70,9 @@ def draw(study: Study) -> Drawing:
     return Drawing(made, HEADS, rows, remarks)
 
 
-def _chosen(study: Study) -> list[RunData]:
+def _chosen(results: Results) -> list[RunData]:
     """Of the first family and task with sparse runs: one run of each method."""
-    sparse = [run for run in study.main if run.label in ORDER]
+    sparse = [run for run in results.main if run.label in ORDER]
     if not sparse:
         return []
     place = min((run.family, run.env_id) for run in sparse)

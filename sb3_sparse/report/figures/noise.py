@@ -6,15 +6,13 @@ from collections import defaultdict
 from typing import Any
 
 from sb3_sparse.report.figures.base import Drawing, figure, legend, line, panels
-from sb3_sparse.report.measured import returns_by_sigma
+from sb3_sparse.report.measured import NOISE, returns_by_sigma
 from sb3_sparse.report.methods import DENSE, name_of, percent, shaded
+from sb3_sparse.report.results import NotEnoughData, Results
 from sb3_sparse.report.statistics import means_at
-from sb3_sparse.report.study import NotEnoughData, Study
 
-HEADS = ("family", "environment", "method", "parameters kept", "sigma", "return", "low", "high") + (
-    "seeds",
-)
-FILE = "robustness.csv"
+HEADS = ("family", "environment", "method", "parameters kept", "sigma", "return", "low", "high",
+         "seeds")  # fmt: skip
 
 
 @figure(
@@ -24,16 +22,16 @@ FILE = "robustness.csv"
     "95 % Student t intervals over seeds; colours tell how many parameters are kept, markers "
     "and line styles the method.",
 )
-def draw(study: Study) -> Drawing:
+def draw(results: Results) -> Drawing:
     """A panel an environment, a line for each method and regime."""
     found: dict[tuple[str, str], dict[tuple[float, str], list[dict[float, float]]]] = {}
-    for run in study.main:
-        by_sigma = returns_by_sigma(run.measured.get(FILE, ()))
+    for run in results.main:
+        by_sigma = returns_by_sigma(run.measured)
         if by_sigma:
             lines = found.setdefault((run.family, run.env_id), defaultdict(list))
             lines[run.level, run.label].append(by_sigma)
     if not found:
-        raise NotEnoughData(f"no run has a {FILE}")
+        raise NotEnoughData(f"no run has a {NOISE}")
     made, axes = panels(len(found), columns=3, height=3.2)
     regimes = sorted({level for lines in found.values() for level, _ in lines})
     rows: list[list[Any]] = []

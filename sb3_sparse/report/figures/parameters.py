@@ -17,19 +17,11 @@ from sb3_sparse.report.figures.base import (
     panels,
 )
 from sb3_sparse.report.methods import DENSE, EQUAL, in_order, look_of, name_of, percent
+from sb3_sparse.report.results import NotEnoughData, Results
 from sb3_sparse.report.statistics import mean
-from sb3_sparse.report.study import NotEnoughData, Study
 
-HEADS = (
-    "family",
-    "environment",
-    "method",
-    "sparsity",
-    "parameters",
-    "mean score",
-    "low",
-    "high",
-) + ("seeds",)
+HEADS = ("family", "environment", "method", "sparsity", "parameters", "mean score", "low", "high",
+         "seeds")  # fmt: skip
 MARKED = (0.8, 0.9)
 
 
@@ -41,16 +33,16 @@ MARKED = (0.8, 0.9)
     "The horizontal line is the dense network of full size, the vertical one marks 80 % sparsity "
     "(90 % where no run has 80 %).",
 )
-def draw(study: Study) -> Drawing:
+def draw(results: Results) -> Drawing:
     """A panel an environment, a line a method."""
     places = [
         (family, env_id)
-        for family in study.families()
-        for env_id in study.envs(family)
+        for family in results.families()
+        for env_id in results.envs(family)
         if any(
-            study.cell(family, env_id, label, level)
-            for level in study.levels(family)
-            for label in study.labels(family, level)
+            results.cell(family, env_id, label, level)
+            for level in results.levels(family)
+            for label in results.labels(family, level)
             if label != DENSE
         )
     ]
@@ -59,20 +51,20 @@ def draw(study: Study) -> Drawing:
     made, axes = panels(len(places), columns=3, height=3.2)
     rows: list[list[Any]] = []
     for one, (family, env_id) in zip(axes, places, strict=True):
-        rows += _panel(one, study, family, env_id)
+        rows += _panel(one, results, family, env_id)
     legend(made, axes)
     return Drawing(made, HEADS, rows)
 
 
-def _panel(one: Axes, study: Study, family: str, env_id: str) -> list[list[Any]]:
+def _panel(one: Axes, results: Results, family: str, env_id: str) -> list[list[Any]]:
     rows: list[list[Any]] = []
     annotated = False
-    labels = in_order(set(study.labels(family)))
+    labels = in_order(set(results.labels(family)))
     # pruning carries the annotations, as in the paper; else the first sparse method
     for label in sorted(labels, key=lambda label: (label in (DENSE, EQUAL), label != "prune")):
         points = []
-        for level in [0.0] if label == DENSE else study.levels(family):
-            runs = study.cell(family, env_id, label, level)
+        for level in [0.0] if label == DENSE else results.levels(family):
+            runs = results.cell(family, env_id, label, level)
             if runs:
                 parameters = fmean(run.parameters for run in runs)
                 points.append((parameters, level, mean([run.score for run in runs])))

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 
 from sb3_sparse.report.figures.base import Drawing, figure, legend, line, panels
-from sb3_sparse.report.methods import look_of, name_of, percent
+from sb3_sparse.report.methods import look_of, name_of
+from sb3_sparse.report.results import Results
 from sb3_sparse.report.scores import panels_of
 from sb3_sparse.report.statistics import profile
-from sb3_sparse.report.study import Study
 
 HEADS = ("family", "sparsity", "method", "threshold", "share", "low", "high", "seeds", "tasks")
 POINTS, REPS = 61, 1000
@@ -22,22 +22,22 @@ POINTS, REPS = 61, 1000
     "Share of runs over all tasks whose normalised score exceeds the threshold, with 95 % "
     "pointwise stratified bootstrap bands (rliable). Higher is better.",
 )
-def draw(study: Study) -> Drawing:
+def draw(results: Results) -> Drawing:
     """A panel a sparsity, a line a method."""
-    found, remarks = panels_of(study)
+    found, remarks = panels_of(results)
     made, axes = panels(len(found))
     rows: list[list[Any]] = []
-    for one, (family, level, scores, tasks) in zip(axes, found, strict=True):
-        every = np.concatenate([scores[label].ravel() for label in scores])
+    for one, panel in zip(axes, found, strict=True):
+        every = np.concatenate([scores.ravel() for scores in panel.scores.values()])
         pad = 0.05 * (np.ptp(every) or 1.0)
         taus = np.linspace(every.min() - pad, every.max() + pad, POINTS)
-        for label, given in scores.items():
+        for label, given in panel.scores.items():
             ends = profile(given, taus, REPS)
             line(one, taus.tolist(), ends, look_of(label), name_of(label))
             for tau, *values in zip(taus, *ends, strict=True):
-                place: list[Any] = [family, level, label, float(tau)]
-                rows.append([*place, *map(float, values), len(given), len(tasks)])
-        one.set_title(f"{family}\n{percent(level)}, {len(tasks)} task(s)")
+                place: list[Any] = [panel.family, panel.level, label, float(tau)]
+                rows.append([*place, *map(float, values), len(given), len(panel.tasks)])
+        one.set_title(panel.title)
         one.set_xlabel("normalised score")
         one.set_ylabel("share of runs above")
         one.set_ylim(-0.03, 1.03)

@@ -14,19 +14,11 @@ from sb3_sparse.report.figures.base import (
     panels,
 )
 from sb3_sparse.report.methods import DENSE, name_of, percent, shaded
+from sb3_sparse.report.results import NotEnoughData, Results
 from sb3_sparse.report.statistics import mean
-from sb3_sparse.report.study import NotEnoughData, Study
 
-HEADS = (
-    "family",
-    "environment",
-    "method",
-    "budget",
-    "actor's share",
-    "mean score",
-    "low",
-    "high",
-) + ("seeds",)
+HEADS = ("family", "environment", "method", "budget", "actor's share", "mean score", "low", "high",
+         "seeds")  # fmt: skip
 Line = tuple[str, float, str]
 
 
@@ -37,12 +29,12 @@ Line = tuple[str, float, str]
     "budget of parameters, with 95 % Student t intervals. The vertical line is the standard "
     "split, the horizontal one the dense network of full size.",
 )
-def draw(study: Study) -> Drawing:
+def draw(results: Results) -> Drawing:
     """A panel an environment, a line a budget and method."""
     found: dict[tuple[str, str], dict[Line, dict[float, list[RunData]]]] = {}
-    for run in study.trained:
+    for run in results.trained:
         if run.actor_share is not None:
-            kind = (run.label, _budget(study, run), run.variant("actor_share", "net_arch"))
+            kind = (run.label, _budget(results, run), run.variant("actor_share", "net_arch"))
             shares = found.setdefault((run.family, run.env_id), {}).setdefault(kind, {})
             shares.setdefault(round(run.actor_share, 2), []).append(run)
     places = {
@@ -68,10 +60,10 @@ def draw(study: Study) -> Drawing:
             text = f"{name}, {percent(budget)} of parameters"
             shown = [100 * x for x in estimates]
             estimates_line(one, shown, list(estimates.values()), look, text)
-        usual = _usual(study, family, env_id)
+        usual = _usual(results, family, env_id)
         if usual is not None:
             one.axvline(100 * usual, color="#999999", linewidth=0.9, linestyle=":")
-        dense = study.cell(family, env_id, DENSE, 0.0)
+        dense = results.cell(family, env_id, DENSE, 0.0)
         if dense:
             level_line = mean([run.score for run in dense]).value
             one.axhline(level_line, color="#444444", linestyle="--", label=name_of(DENSE))
@@ -82,24 +74,24 @@ def draw(study: Study) -> Drawing:
     return Drawing(made, HEADS, rows)
 
 
-def _budget(study: Study, run: RunData) -> float:
+def _budget(results: Results, run: RunData) -> float:
     """Share of the connections of the largest dense network; of dense ones to one digit."""
     if run.label != DENSE:
         return round(1 - run.level, 6)
     dense = [
         other.connections
-        for other in study.trained
+        for other in results.trained
         if (other.family, other.env_id, other.label) == (run.family, run.env_id, DENSE)
     ]
     return float(f"{run.connections / max(dense):.1g}")
 
 
-def _usual(study: Study, family: str, env_id: str) -> float | None:
+def _usual(results: Results, family: str, env_id: str) -> float | None:
     """The split that nobody asked for: that of the runs without an ``actor_share``."""
     shares: dict[str, list[float]] = defaultdict(list)
-    for run in study.trained:
+    for run in results.trained:
         if (run.family, run.env_id) == (family, env_id) and run.actor_share is not None:
             widths = "net_arch" in run.record["run"].get("hyperparams", {})
-            asked = widths or study.setting(run, "actor_share") is not None
+            asked = widths or results.setting(run, "actor_share") is not None
             shares["asked" if asked else "usual"].append(run.actor_share)
     return sorted(shares["usual"])[len(shares["usual"]) // 2] if shares["usual"] else None

@@ -13,13 +13,11 @@ from sb3_sparse.report.figures.base import (
     panels,
 )
 from sb3_sparse.report.methods import DENSE, in_order, look_of, name_of, percent
+from sb3_sparse.report.results import NotEnoughData, Results
 from sb3_sparse.report.statistics import mean
-from sb3_sparse.report.study import NotEnoughData, Study
 
-HEADS = ("family", "environment", "sparsity", "method", "setting", "value", "mean score", "low") + (
-    "high",
-    "seeds",
-)
+HEADS = ("family", "environment", "sparsity", "method", "setting", "value", "mean score", "low",
+         "high", "seeds")  # fmt: skip
 Place = tuple[str, str, float]
 
 
@@ -29,16 +27,16 @@ Place = tuple[str, str, float]
     "Mean score against the values of the setting that was varied, all other settings of a line "
     "being the same, with 95 % Student t intervals; a panel for each environment and sparsity.",
 )
-def draw(study: Study) -> Drawing:
+def draw(results: Results) -> Drawing:
     """A panel for each environment and sparsity, a line a method."""
-    name = study.varies
+    name = results.varies
     if name is None:
         raise NotEnoughData("it needs the name of the setting that was varied (varies)")
     found: dict[Place, dict[tuple[str, str], dict[Any, list[RunData]]]] = {}
-    for run in study.trained:
+    for run in results.trained:
         kind = (run.label, run.variant(name))
         values = found.setdefault((run.family, run.env_id, run.level), {}).setdefault(kind, {})
-        values.setdefault(_key(study.setting(run, name)), []).append(run)
+        values.setdefault(_key(results.setting(run, name)), []).append(run)
     places = {
         place: kept
         for place, lines in found.items()

@@ -13,33 +13,13 @@ from sb3_sparse.report.figures.base import (
     logarithmic,
     panels,
 )
-from sb3_sparse.report.measured import series
+from sb3_sparse.report.measured import SNR, Points, snr_by_network
 from sb3_sparse.report.methods import DENSE, name_of, percent, shaded
+from sb3_sparse.report.results import NotEnoughData, Results
 from sb3_sparse.report.statistics import means_at
-from sb3_sparse.report.study import NotEnoughData, Study
 
-HEADS = (
-    "family",
-    "environment",
-    "network",
-    "method",
-    "sparsity",
-    "timesteps",
-    "snr",
-    "low",
-    "high",
-) + ("seeds",)
-FILE, PREFIX = "snr.csv", "snr/"
-Points = list[tuple[float, float]]
-
-
-def of_networks(names: dict[str, Points]) -> dict[str, Points]:
-    """The series over all parameters of a network, active or not, by network."""
-    return {
-        name.removeprefix(PREFIX): points
-        for name, points in names.items()
-        if name.startswith(PREFIX) and "/" not in name.removeprefix(PREFIX)
-    }
+HEADS = ("family", "environment", "network", "method", "sparsity", "timesteps", "snr", "low",
+         "high", "seeds")  # fmt: skip
 
 
 @figure(
@@ -49,15 +29,15 @@ def of_networks(names: dict[str, Points]) -> dict[str, Points]:
     "a minibatch, over training, with 95 % Student t intervals over seeds; a panel for each "
     "network, a colour for each sparsity, a marker and line style for each method.",
 )
-def draw(study: Study) -> Drawing:
+def draw(results: Results) -> Drawing:
     """A panel a network, a line for each method and sparsity."""
     found: dict[tuple[str, str, str], dict[tuple[str, float], list[Points]]] = {}
-    for run in study.main:
-        for network, points in of_networks(series(run.measured.get(FILE, ()))).items():
+    for run in results.main:
+        for network, points in snr_by_network(run.measured).items():
             lines = found.setdefault((run.family, run.env_id, network), defaultdict(list))
             lines[run.label, run.level].append(points)
     if not found:
-        raise NotEnoughData(f"no run has a {FILE}")
+        raise NotEnoughData(f"no run has a {SNR}")
     made, axes = panels(len(found), columns=3, height=3.0)
     levels = sorted({level for lines in found.values() for _, level in lines})
     rows: list[list[Any]] = []

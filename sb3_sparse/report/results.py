@@ -21,7 +21,7 @@ class NotEnoughData(SparsityError):
 
 
 @dataclass(frozen=True)
-class Study:
+class Results:
     """Runs with what is derived of them.
 
     :param runs: all that were read

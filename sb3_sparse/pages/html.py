@@ -1,4 +1,4 @@
-"""HTML of a page that needs nothing but itself: text, tables that sort, figures, style, script."""
+"""The HTML of a page that needs nothing but itself: text, sortable tables, figures, style."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from html import escape
 from typing import Any
 
-from sb3_sparse.report.tables import Table
+from sb3_sparse.pages.table import Table
 
 READABLE = 0.9  # CSS pixels a point
 STYLE = """
@@ -34,13 +34,13 @@ th[aria-sort="ascending"] button::after { content: " \\25B2"; }
 th[aria-sort="descending"] button::after { content: " \\25BC"; }
 td.number { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
 td.wide { min-width: 10.5rem; }
-td.supported, td.contradicted, td.undecided { font-weight: 600; white-space: nowrap; }
-td.supported::before { content: "\\2713  "; } td.contradicted::before { content: "\\2717  "; }
-td.undecided::before { content: "?  "; }
-td.supported { color: light-dark(#0a6b3d, #6fd6a2); }
-td.contradicted { color: light-dark(#a8154f, #ff8ab8); }
+td.good, td.bad, td.open { font-weight: 600; white-space: nowrap; }
+td.good::before { content: "\\2713  "; } td.bad::before { content: "\\2717  "; }
+td.open::before { content: "?  "; }
+td.good { color: light-dark(#0a6b3d, #6fd6a2); }
+td.bad { color: light-dark(#a8154f, #ff8ab8); }
 figure { margin: 1rem 0 2rem; }
-figure .frame { background: #fff; border: 1px solid var(--line); border-radius: 6px;
+.frame { background: #fff; border: 1px solid var(--line); border-radius: 6px;
   padding: .5rem; overflow-x: auto; }
 figure img { display: block; max-width: 100%; height: auto; margin: 0 auto; }
 figcaption { font-size: .9rem; margin-top: .4rem; }
@@ -71,16 +71,18 @@ document.querySelectorAll("th button").forEach(function (button) {
 """
 
 
-def page(title: str, parts: Iterable[str]) -> str:
-    """A whole page of HTML parts.
+def page(title: str, parts: Iterable[str], script: str = "") -> str:
+    """Join HTML parts to a whole page.
 
     :param title: text
     :param parts: HTML
+    :param script: JavaScript that the parts need
     """
+    head = f"<script>{script}</script>" if script else ""
     return (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{escape(title)}</title>\n<style>{STYLE}</style></head>\n"
+        f"<title>{escape(title)}</title>\n<style>{STYLE}</style>{head}</head>\n"
         f"<body>\n<h1>{escape(title)}</h1>\n"
         + "\n".join(parts)
         + f"\n<script>{SCRIPT}</script>\n</body></html>\n"
@@ -88,38 +90,68 @@ def page(title: str, parts: Iterable[str]) -> str:
 
 
 def section(heading: str, *parts: str) -> str:
-    """A part under a heading of its own."""
+    """Put parts under a heading."""
     body = "\n".join(parts)
     return f"<section><h2>{escape(heading)}</h2>\n{body}\n</section>"
 
 
-def paragraph(text: str) -> str:
-    """A paragraph of text."""
-    return f"<p>{escape(text)}</p>"
+def subsection(heading: str, *parts: str) -> str:
+    """Put parts under a heading within a section."""
+    return "\n".join([f"<h3>{escape(heading)}</h3>", *parts])
+
+
+def paragraph(text: str, *links: str) -> str:
+    """Make a paragraph of a text, and of links behind it."""
+    return f"<p>{' '.join([*([escape(text)] if text else []), *links])}</p>"
 
 
 def listing(texts: Iterable[str]) -> str:
-    """A list of texts, an item each."""
+    """Make a list of texts."""
     return "<ul>" + "".join(f"<li>{escape(text)}</li>\n" for text in texts) + "</ul>"
 
 
 def folded(summary: str, *parts: str) -> str:
-    """Parts that show when their summary is clicked."""
+    """Hide parts until their summary is clicked."""
     return f"<details><summary>{escape(summary)}</summary>\n{''.join(parts)}</details>"
 
 
 def code(text: str) -> str:
-    """A block of code."""
+    """Make a block of code."""
     return f"<pre><code>{escape(text)}</code></pre>"
 
 
 def link(address: str, text: str) -> str:
-    """A link with a text."""
+    """Make a link."""
     return f'<a href="{escape(address)}">{escape(text)}</a>'
 
 
+def frame(picture: str) -> str:
+    """Put a picture on white, where it scrolls if it is wide."""
+    return f'<div class="frame">{picture}</div>'
+
+
+def figure(
+    name: str, title: str, picture: str, caption: str, links: Iterable[str], *parts: str
+) -> str:
+    """Frame a picture, with its title above and its caption below.
+
+    :param name: address of the figure within the page
+    :param picture: HTML, e.g. of :func:`image`
+    :param links: HTML behind the caption
+    :param parts: HTML below it
+    """
+    return (
+        f'<figure id="{escape(name)}"><h3>{escape(title)}</h3>\n{frame(picture)}\n'
+        f"<figcaption>{escape(caption)} {' '.join(links)}</figcaption>\n{''.join(parts)}</figure>"
+    )
+
+
 def image(svg: bytes, alt: str) -> str:
-    """A picture inside the page itself; one that is wide scrolls rather than shrink to nothing."""
+    """Embed a drawing; a wide one keeps a readable size.
+
+    :param svg: the drawing
+    :param alt: what it shows, as text
+    """
     data = base64.b64encode(svg).decode()
     points = re.search(rb'<svg[^>]* width="([0-9.]+)pt"', svg)
     width = round(READABLE * float(points.group(1))) if points else 0
@@ -128,31 +160,26 @@ def image(svg: bytes, alt: str) -> str:
 
 
 def table(given: Table) -> str:
-    """A table that scrolls by itself and sorts by a click, or by keys, on its heads."""
+    """Make a table that scrolls by itself, and sorts by a click or a key on a head."""
     heads = "".join(
         f'<th scope="col" aria-sort="none"><button type="button">{escape(head)}</button></th>'
         for head in given.heads
     )
-    rows = "".join(f"<tr>{''.join(map(_cell, row))}</tr>\n" for row in given.rows)
+    rows = "".join(
+        f"<tr>{''.join(_cell(value, given) for value in row)}</tr>\n" for row in given.rows
+    )
     return (
         '<div class="scroll" tabindex="0" role="region" aria-label="table">'
         f"<table><thead><tr>{heads}</tr></thead>\n<tbody>{rows}</tbody></table></div>"
     )
 
 
-VERDICTS = {
-    "supported": "supported",
-    "contradicted": "contradicted",
-    "not enough data": "undecided",
-}
-
-
-def _cell(value: Any) -> str:
+def _cell(value: Any, table: Table) -> str:
     if value is None or (isinstance(value, float) and math.isnan(value)):
         return "<td></td>"
     if isinstance(value, (int, float)) and not isinstance(value, bool):
-        text = f"{value:,}" if isinstance(value, int) else f"{value:.4g}"
+        text = f"{value:,}" if isinstance(value, int) else f"{value:.{table.digits}g}"
         return f'<td class="number" data-value="{value!r}">{text}</td>'
     text = str(value)
-    kind = VERDICTS.get(text) or ("wide" if len(text) > 40 else "")
+    kind = table.marks.get(text) or ("wide" if len(text) > 40 else "")
     return f'<td class="{kind}">{escape(text)}</td>' if kind else f"<td>{escape(text)}</td>"
