@@ -29,6 +29,7 @@ th, td { padding: .3rem .6rem; text-align: left; border-bottom: 1px solid var(--
 th { background: var(--soft); white-space: nowrap; padding: 0; }
 th button { all: unset; cursor: pointer; padding: .4rem .6rem; display: block; width: 100%;
   box-sizing: border-box; font-weight: 600; }
+th.number button { text-align: right; }
 th button:focus-visible { outline: 2px solid var(--link); outline-offset: -2px; }
 th[aria-sort="ascending"] button::after { content: " \\25B2"; }
 th[aria-sort="descending"] button::after { content: " \\25BC"; }
@@ -162,8 +163,9 @@ def image(svg: bytes, alt: str) -> str:
 def table(given: Table) -> str:
     """Make a table that scrolls by itself, and sorts by a click or a key on a head."""
     heads = "".join(
-        f'<th scope="col" aria-sort="none"><button type="button">{escape(head)}</button></th>'
-        for head in given.heads
+        f'<th scope="col" aria-sort="none"{_side(place, given)}>'
+        f'<button type="button">{escape(head)}</button></th>'
+        for place, head in enumerate(given.heads)
     )
     rows = "".join(
         f"<tr>{''.join(_cell(value, given) for value in row)}</tr>\n" for row in given.rows
@@ -174,10 +176,19 @@ def table(given: Table) -> str:
     )
 
 
+def _side(column: int, table: Table) -> str:
+    values = [row[column] for row in table.rows if row[column] is not None]
+    return ' class="number"' if values and all(map(_is_number, values)) else ""
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
 def _cell(value: Any, table: Table) -> str:
     if value is None or (isinstance(value, float) and math.isnan(value)):
         return "<td></td>"
-    if isinstance(value, (int, float)) and not isinstance(value, bool):
+    if _is_number(value):
         text = f"{value:,}" if isinstance(value, int) else f"{value:.{table.digits}g}"
         return f'<td class="number" data-value="{value!r}">{text}</td>'
     text = str(value)
