@@ -8,7 +8,6 @@ does.
 from __future__ import annotations
 
 import sys
-from importlib import import_module
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
@@ -16,6 +15,13 @@ from typing import TYPE_CHECKING
 
 from sb3_sparse.algorithms.table import HOMES
 from sb3_sparse.lazy import lazily
+from sb3_sparse.policies.registry import (
+    CONTRIB,
+    SparsePolicy,
+    register_policy,
+    registered,
+    supported_algorithms,
+)
 
 if TYPE_CHECKING:
     from sb3_sparse.algorithms.a2c import A2C
@@ -26,9 +32,10 @@ if TYPE_CHECKING:
     from sb3_sparse.callback import SparsityCallback
     from sb3_sparse.compress.twin import sparsify
     from sb3_sparse.policies.actor_critic import SparseActorCriticPolicy
-    from sb3_sparse.policies.aliases import SparsePolicy, supported_algorithms
+    from sb3_sparse.policies.base import BaseSparsePolicy
     from sb3_sparse.policies.dqn import SparseDQNPolicy
     from sb3_sparse.policies.sac import SparseSACPolicy
+    from sb3_sparse.policies.spec import NetworkSpec, PassCounts
     from sb3_sparse.policies.td3 import SparseTD3Policy
 
 __version__ = version("sb3-sparse")
@@ -39,12 +46,16 @@ __all__ = [
     "PPO",
     "SAC",
     "TD3",
+    "BaseSparsePolicy",
+    "PassCounts",
+    "NetworkSpec",
     "SparseActorCriticPolicy",
     "SparseDQNPolicy",
     "SparsePolicy",
     "SparseSACPolicy",
     "SparseTD3Policy",
     "SparsityCallback",
+    "register_policy",
     "sparsify",
     "supported_algorithms",
 ]
@@ -55,15 +66,21 @@ __getattr__, __dir__ = lazily(
     __name__,
     {
         **{name: f"algorithms.{home}" for name, home in HOMES.items()},
+        "BaseSparsePolicy": "policies.base",
+        "PassCounts": "policies.spec",
+        "NetworkSpec": "policies.spec",
         "SparseActorCriticPolicy": "policies.actor_critic",
         "SparseDQNPolicy": "policies.dqn",
-        "SparsePolicy": "policies.aliases",
         "SparseSACPolicy": "policies.sac",
         "SparseTD3Policy": "policies.td3",
         "SparsityCallback": "callback",
         "sparsify": "compress.twin",
-        "supported_algorithms": "policies.aliases",
         **dict.fromkeys(_CONTRIB, "policies.contrib"),
+    },
+    {
+        name: f"sb3_sparse has no {name} of its own: sb3_contrib.{name} takes SparsePolicy, and "
+        "trains it in SB3's own gradient steps"
+        for name in CONTRIB
     },
 )
 
@@ -75,4 +92,4 @@ def _is_command_line() -> bool:
 
 
 if not _is_command_line():
-    import_module(f"{__name__}.policies.aliases")  # which registers the policies
+    registered()

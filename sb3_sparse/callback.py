@@ -6,8 +6,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_sparse.engine.plan import Plan
 from sb3_sparse.errors import ConfigError, warn
+from sb3_sparse.policies.base import BaseSparsePolicy
 from sb3_sparse.policies.compiled import unwrapped
-from sb3_sparse.policies.mixin import SparsePolicyMixin
 from sb3_sparse.topology import method_named
 
 DEFAULTS = {"update_interval": 1000, "drop_fraction": 0.5, "end": 0.8, "update_on": "step"}
@@ -70,9 +70,9 @@ class SparsityCallback(BaseCallback):
             )
         self.plan = Plan(method, **{**DEFAULTS, "begin": topology.default_begin, **given})  # type: ignore[arg-type]
 
-    def _sparse_policy(self) -> SparsePolicyMixin:
+    def _sparse_policy(self) -> BaseSparsePolicy:
         policy = unwrapped(self.model.policy)
-        if not isinstance(policy, SparsePolicyMixin):
+        if not isinstance(policy, BaseSparsePolicy):
             raise ConfigError(
                 f"SparsityCallback needs a sparse policy, got {type(policy).__name__}; make the "
                 'model with SparsePolicy, e.g. SAC("SparsePolicy", env, '

@@ -9,7 +9,7 @@ from typing import Any
 
 
 def lazily(
-    package: str, homes: Mapping[str, str]
+    package: str, homes: Mapping[str, str], absent: Mapping[str, str] | None = None
 ) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
     """``__getattr__`` and ``__dir__`` of a package that imports its modules as they are needed.
 
@@ -19,11 +19,13 @@ def lazily(
 
     :param package: its ``__name__``
     :param homes: the module of each name, relative to the package, e.g. ``{"Study": "spec"}``
+    :param absent: what to say of names that the package might be expected to have
     """
 
     def getattr_(name: str) -> Any:
         if name not in homes:
-            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+            usual = f"module {package!r} has no attribute {name!r}"
+            raise AttributeError((absent or {}).get(name, usual))
         return getattr(import_module(f"{package}.{homes[name]}"), name)
 
     def dir_() -> list[str]:

@@ -87,8 +87,8 @@ def test_imports_point_down(path):
 
 def test_the_checker_sees_an_arrow_that_points_up(tmp_path):
     wrong = tmp_path / "wrong.py"
-    wrong.write_text("from sb3_sparse.policies.mixin import SparsePolicyMixin\n")
-    assert "sb3_sparse.policies.mixin" in imports_of(wrong)
+    wrong.write_text("from sb3_sparse.policies.base import BaseSparsePolicy\n")
+    assert "sb3_sparse.policies.base" in imports_of(wrong)
     assert HEIGHT["policies"] > HEIGHT["engine"] > HEIGHT["topology"] > HEIGHT["sparsity"]
 
 

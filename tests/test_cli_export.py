@@ -13,7 +13,7 @@ from support import make
 from sb3_sparse import cli
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.export.numpy_policy import Policy
-from sb3_sparse.zoo.saved import algo_of, find_saved
+from sb3_sparse.zoo.saved import algos_of, find_saved
 from sb3_sparse.zoo.spec import RunSpec
 from sb3_sparse.zoo.training import train
 
@@ -175,10 +175,10 @@ def test_mistakes_are_one_line(arguments, message, monkeypatch, capsys, tmp_path
 @pytest.mark.parametrize("policy", ["SparsePolicy", "MlpPolicy"])
 def test_a_file_tells_its_algorithm(algorithm, policy, tmp_path):
     make(algorithm, policy=policy).save(tmp_path / "model.zip")
-    assert algo_of(tmp_path / "model.zip") == algorithm.lower()
+    assert algos_of(tmp_path / "model.zip")[0] == algorithm.lower()
 
 
 def test_a_recurrent_policy_is_not_taken_for_one_of_ppo(tmp_path):
     RecurrentPPO("MlpLstmPolicy", "CartPole-v1", device="cpu").save(tmp_path / "model.zip")
     with pytest.raises(ConfigError, match="belongs to no supported algorithm; allowed are dqn"):
-        algo_of(tmp_path / "model.zip")
+        algos_of(tmp_path / "model.zip")

@@ -15,14 +15,14 @@ HOMES = {"A2C": "a2c", "DDPG": "td3", "DQN": "dqn", "PPO": "ppo", "SAC": "sac", 
 def algorithm_named(name: str) -> type[BaseAlgorithm]:
     """The class of an algorithm: this package's where it has one, else sb3-contrib's.
 
-    :param name: one of :func:`~sb3_sparse.policies.names.algorithm_names`
+    :param name: one of :func:`~sb3_sparse.policies.registry.algorithm_names`
     """
     if name in HOMES:
         found: type[BaseAlgorithm] = getattr(
             import_module(f"sb3_sparse.algorithms.{HOMES[name]}"), name
         )
         return found
-    from sb3_sparse.policies.aliases import supported_algorithms
+    from sb3_sparse.policies.registry import supported_algorithms
 
     return supported_algorithms()[name]
 

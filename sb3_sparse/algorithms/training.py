@@ -25,8 +25,8 @@ from sb3_sparse.engine.paths import parts_of
 from sb3_sparse.fused.errors import NotCovered
 from sb3_sparse.fused.machine import Machine
 from sb3_sparse.fused.program import Parts, Program
+from sb3_sparse.policies.base import BaseSparsePolicy
 from sb3_sparse.policies.compiled import unwrapped
-from sb3_sparse.policies.mixin import SparsePolicyMixin
 from sb3_sparse.policies.shortcut import only_flattens, takes_vectors, untouched
 from sb3_sparse.policies.storage import KNOWN
 
@@ -77,7 +77,7 @@ class Training:
         policy = model.policy
         if unwrapped(policy) is not policy:
             raise NotCovered("the policy is compiled")
-        if not isinstance(policy, SparsePolicyMixin):
+        if not isinstance(policy, BaseSparsePolicy):
             raise NotCovered(f"the policy, {type(policy).__name__}, is not sparse")
         settings = self._settings_now()
         if self._changes is None or settings != self._settings or not self._changes.unchanged():
@@ -147,7 +147,7 @@ class Training:
         return machine
 
 
-def _check_policy(policy: SparsePolicyMixin, methods: dict[str, tuple[str, ...]]) -> None:
+def _check_policy(policy: BaseSparsePolicy, methods: dict[str, tuple[str, ...]]) -> None:
     if (missing := why_missing()) is not None:
         raise NotCovered(f"there are no kernels: {missing}")
     if policy.device.type != "cpu":
@@ -177,7 +177,7 @@ def _is_watched(tensor: Any) -> bool:
     )  # fmt: skip
 
 
-def _trained(policy: SparsePolicyMixin) -> Iterable[th.Tensor]:
+def _trained(policy: BaseSparsePolicy) -> Iterable[th.Tensor]:
     for optimizer in policy.sparse.optimizers:
         for group in optimizer.param_groups:
             yield from group["params"]
@@ -224,7 +224,7 @@ class Fused(BaseAlgorithm):
 
     def _setup_model(self) -> None:
         super()._setup_model()  # type: ignore[safe-super]
-        if isinstance(self.policy, SparsePolicyMixin):
+        if isinstance(self.policy, BaseSparsePolicy):
             self.policy.use_kernels()  # also where it has no zeros, and so would stay stock SB3's
 
     def _excluded_save_params(self) -> list[str]:
@@ -282,5 +282,5 @@ class Fused(BaseAlgorithm):
         training.reason = reason = why.reason
         if reason not in training.said:
             training.said.add(reason)
-            if isinstance(unwrapped(self.policy), SparsePolicyMixin):
+            if isinstance(unwrapped(self.policy), BaseSparsePolicy):
                 self.logger.info(f"Gradient steps are Stable-Baselines3's own: {reason}")

@@ -10,13 +10,15 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 
+from sb3_sparse.algorithms.table import trainer_of
 from sb3_sparse.analysis.networks import modules_of, prunable_of, specs_of
-from sb3_sparse.analysis.passes import PassCounts, batch_size_of, passes_of
 from sb3_sparse.engine.network import SparseNetwork
 from sb3_sparse.errors import ConfigError
+from sb3_sparse.policies.base import BaseSparsePolicy
 from sb3_sparse.policies.compiled import unwrapped
-from sb3_sparse.policies.mixin import SparsePolicyMixin
+from sb3_sparse.policies.registry import registered
 from sb3_sparse.policies.report import LayerReport, SparsityReport, report_on
+from sb3_sparse.policies.spec import PassCounts
 from sb3_sparse.sparsity.numeric import is_whole
 
 
@@ -142,8 +144,8 @@ def flops(
     A gradient step counts, for each sample of the minibatch: 1 for a forward pass; 2 for a backward
     pass of what is trained; target networks forward only; 1 for handing a gradient on to the actor
     through a critic (stock SB3 computes the critic's weight gradients there too and throws them
-    away, which is not counted). How often each network runs is in
-    :mod:`sb3_sparse.analysis.passes`; delays and minibatch are the model's. Optimizers, averaging
+    away, which is not counted). How often each network runs is declared where the algorithm is
+    registered; delays and minibatch are the model's. Optimizers, averaging
     of targets, normalisation layers, losses and RigL's dense gradients are not counted.
 
     :param policy_or_model: sparse or stock, with any features extractor of Linear and Conv layers
@@ -171,6 +173,30 @@ def flops(
     return FlopsReport(layers, type(model).__name__, size, tuple(passes))
 
 
+def passes_of(model: BaseAlgorithm) -> list[PassCounts]:
+    """The passes of one gradient step, with the model's own settings.
+
+    :raises ConfigError: for an algorithm whose ``train()`` is none of the known ones
+    """
+    trainer = trainer_of(type(model))
+    known = {name: one for name, one in registered().items() if one.passes is not None}
+    for one in known.values():
+        if one.passes is not None and trainer_of(one.algorithm) is trainer:
+            return one.passes(model)
+    raise ConfigError(
+        f"how often {type(model).__name__} runs its networks in a gradient step is not known; it "
+        f"is for {', '.join(known)}. Give its passes to sb3_sparse.register_policy, or call "
+        "flops(model.policy), which counts forward passes alone"
+    )
+
+
+def batch_size_of(model: Any) -> int:
+    """Samples of the model's minibatch."""
+    if hasattr(model, "batch_size"):
+        return int(model.batch_size)
+    return int(model.n_steps * model.n_envs)  # A2C takes the whole rollout
+
+
 def _layer(r: LayerReport, times: float | None) -> LayerFlops:
     step = None if times is None else times * r.flops
     dense = None if times is None else times * r.dense_flops
@@ -179,7 +205,7 @@ def _layer(r: LayerReport, times: float | None) -> LayerFlops:
 
 def _report(policy: BasePolicy) -> SparsityReport:
     """The sparsity report; of a stock policy that of a policy with all of its layers left dense."""
-    if isinstance(policy, SparsePolicyMixin):
+    if isinstance(policy, BaseSparsePolicy):
         return policy.sparsity_report()
     owned = _owned(policy)
     return report_on(

@@ -18,6 +18,7 @@ from sb3_sparse.algorithms.table import trainer_of
 from sb3_sparse.errors import ConfigError
 
 Samples = dict[str, Any]
+MakeLosses = Callable[[Any, Any, Any], "list[Loss]"]
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,24 @@ class Loss:
     of_sample: Callable[[Any, Samples], th.Tensor]
 
 
+_losses: dict[type[Any], MakeLosses] = {}
+
+
+def register_losses(algorithm: type[BaseAlgorithm]) -> Callable[[MakeLosses], MakeLosses]:
+    """Decorator of the function that makes an algorithm's losses, for :func:`gradient_snr`.
+
+    The function is given a model, a twin of its policy and a minibatch.
+
+    :param algorithm: the class that defines ``train()``
+    """
+
+    def register(losses: MakeLosses) -> MakeLosses:
+        _losses[trainer_of(algorithm)] = losses
+        return losses
+
+    return register
+
+
 def _one(observation: Any) -> Any:
     """A batch of one sample."""
     return pytree.tree_map(lambda part: part.unsqueeze(0), observation)
@@ -44,6 +63,7 @@ def _discounts(model: Any, batch: Any) -> Any:
     return model.gamma if discounts is None else discounts
 
 
+@register_losses(DQN)
 def _dqn(model: Any, policy: Any, batch: Any) -> list[Loss]:
     following = policy.q_net_target(batch.next_observations).max(dim=1).values.reshape(-1, 1)
     target = batch.rewards + (1 - batch.dones) * _discounts(model, batch) * following
@@ -67,6 +87,7 @@ def _squashed(actor: Any, observations: Any, noise: th.Tensor) -> tuple[th.Tenso
     return action, (gaussian - correction).sum(dim=1, keepdim=True)
 
 
+@register_losses(SAC)
 def _sac(model: Any, policy: Any, batch: Any) -> list[Loss]:
     if model.use_sde:
         raise ConfigError("gradient_snr does not cover SAC with use_sde=True")
@@ -103,6 +124,7 @@ def _sac(model: Any, policy: Any, batch: Any) -> list[Loss]:
     ]
 
 
+@register_losses(PPO)
 def _ppo(model: Any, policy: Any, batch: Any) -> list[Loss]:
     progress = model._current_progress_remaining
     clip = model.clip_range(progress)
@@ -139,21 +161,18 @@ def _ppo(model: Any, policy: Any, batch: Any) -> list[Loss]:
     return [Loss(("actor", "critic"), samples, of_sample)]
 
 
-LOSSES: dict[type[Any], Callable[[Any, Any, Any], list[Loss]]] = {DQN: _dqn, SAC: _sac, PPO: _ppo}
-
-
-def losses_for(model: BaseAlgorithm) -> Callable[[Any, Any, Any], list[Loss]]:
+def losses_for(algorithm: type[BaseAlgorithm]) -> MakeLosses:
     """What makes an algorithm's losses, from the model, a twin of its policy and a minibatch.
 
     :raises ConfigError: for an algorithm whose ``train()`` is none of the known ones
     """
-    for algorithm, losses in LOSSES.items():
-        if trainer_of(type(model)) is algorithm:
-            return losses
-    raise ConfigError(
-        f"gradient_snr has no loss of {type(model).__name__}; supported are "
-        f"{', '.join(algorithm.__name__ for algorithm in LOSSES)}"
-    )
+    losses = _losses.get(trainer_of(algorithm))
+    if losses is None:
+        raise ConfigError(
+            f"gradient_snr has no loss of {algorithm.__name__}; supported are "
+            f"{', '.join(known.__name__ for known in _losses)}"
+        )
+    return losses
 
 
 @contextmanager

@@ -15,10 +15,10 @@ from sb3_sparse.engine.controller import Controller
 from sb3_sparse.engine.plain import make_plain
 from sb3_sparse.engine.prunable import PRUNABLE_TYPES, UNSUPPORTED_TYPES, Prunable
 from sb3_sparse.errors import UnsupportedError
-from sb3_sparse.policies.aliases import supported_algorithms
+from sb3_sparse.policies.base import BaseSparsePolicy
 from sb3_sparse.policies.compiled import unwrapped
-from sb3_sparse.policies.mixin import SparsePolicyMixin
 from sb3_sparse.policies.parts import WHOLE_POLICY, without_graphs
+from sb3_sparse.policies.registry import sparse_counterpart, supported_algorithms
 from sb3_sparse.policies.spec import NetworkSpec
 
 
@@ -28,15 +28,11 @@ def specs_of(policy: BasePolicy) -> Mapping[str, NetworkSpec]:
     :raises UnsupportedError: for a policy without a counterpart, or with layers elsewhere
     """
     policy = unwrapped(policy)
-    if isinstance(policy, SparsePolicyMixin):
-        return policy.networks
-    for algorithm in supported_algorithms().values():
-        sparse: Any = algorithm.policy_aliases["SparsePolicy"]
-        stock = next(c for c in sparse.__mro__ if not c.__module__.startswith("sb3_sparse."))
-        if isinstance(policy, stock):
-            specs: Mapping[str, NetworkSpec] = sparse.networks
-            _check_complete(policy, specs)
-            return specs
+    sparse = sparse_counterpart(policy)
+    if sparse is not None:
+        if not isinstance(policy, sparse):
+            _check_complete(policy, sparse.networks)
+        return sparse.networks
     raise UnsupportedError(
         f"the networks of {type(policy).__name__} are not known; known are the policies of "
         f"{', '.join(supported_algorithms())}"
@@ -97,7 +93,7 @@ def connections(policy: BasePolicy) -> dict[str, NDArray[Any] | None]:
     for spec in specs_of(policy).values():
         for module in prunable_of(policy, spec).values():
             found[names[id(module.weight)]] = None
-    if isinstance(policy, SparsePolicyMixin):
+    if isinstance(policy, BaseSparsePolicy):
         for layer in policy.sparse.layers:
             found[names[id(layer.weight)]] = layer.mask()
     return found

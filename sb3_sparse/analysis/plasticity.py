@@ -11,8 +11,8 @@ from sb3_sparse.analysis.maskhistory import MaskHistory
 from sb3_sparse.analysis.measurement import MeasurementCallback
 from sb3_sparse.analysis.networks import specs_of
 from sb3_sparse.errors import ConfigError
+from sb3_sparse.policies.base import BaseSparsePolicy
 from sb3_sparse.policies.compiled import unwrapped
-from sb3_sparse.policies.mixin import SparsePolicyMixin
 
 
 class PlasticityCallback(MeasurementCallback):
@@ -71,7 +71,7 @@ class PlasticityCallback(MeasurementCallback):
         super()._on_training_start()
         policy = unwrapped(self.model.policy)
         self.history = None
-        if isinstance(policy, SparsePolicyMixin):
+        if isinstance(policy, BaseSparsePolicy):
             path = None if self.file is None else self.file.path.with_suffix(".masks.npz")
             self.history = MaskHistory(policy.sparse.networks, self.model.num_timesteps, path)
 

@@ -170,7 +170,7 @@ def gradient_snr(
 
     Source: arXiv:2206.10369, section on the signal-to-noise ratio.
     """
-    losses = losses_for(model)
+    losses = losses_for(type(model))
     for name, value in {"batch_size": batch_size, "chunk": chunk}.items():
         if value is not None and (not is_whole(value) or value < 1):
             raise ConfigError(f"{name} must be an integer, 1 or more, got {value!r}")
@@ -242,7 +242,7 @@ class GradientSNRCallback(MeasurementCallback):
         self.batch_size = batch_size
 
     def _init_callback(self) -> None:
-        losses_for(self.model)
+        losses_for(type(self.model))
 
     def measure(self, seed: int) -> Mapping[str, float]:
         return gradient_snr(self.model, batch_size=self.batch_size, seed=seed).values()

@@ -18,9 +18,9 @@ from stable_baselines3.common.save_util import save_to_zip_file
 from sb3_sparse.engine.masked import MaskedStorage
 from sb3_sparse.errors import ConfigError, UnsupportedError
 from sb3_sparse.loading.zips import check_finite
-from sb3_sparse.policies.aliases import supported_algorithms
+from sb3_sparse.policies.base import BaseSparsePolicy
 from sb3_sparse.policies.compiled import unwrapped
-from sb3_sparse.policies.mixin import SparsePolicyMixin
+from sb3_sparse.policies.registry import supported_algorithms
 from sb3_sparse.policies.saving import load_without_buffer, parts_of
 from sb3_sparse.sparsity.selection import largest
 
@@ -54,7 +54,7 @@ def sparsify(
     :param distribution: ``"erk"``, ``"er"`` or ``"uniform"``; None: a sparse model's own, else
         ``"erk"``
     :param dense_layers: layers left dense; None: a sparse model's own, else none
-    :param compute: as of :class:`~sb3_sparse.policies.mixin.SparsePolicyMixin`; None: a sparse
+    :param compute: as of :class:`~sb3_sparse.policies.base.BaseSparsePolicy`; None: a sparse
         model's own, else ``"auto"``
     :raises ConfigError: for a value that is not allowed, or if a layer would need more connections
         than it has
@@ -104,10 +104,10 @@ def load_beside(
     return loaded
 
 
-def sparse_policy(model: BaseAlgorithm) -> SparsePolicyMixin:
+def sparse_policy(model: BaseAlgorithm) -> BaseSparsePolicy:
     """The policy of a model that is known to be sparse."""
     policy = unwrapped(model.policy)
-    assert isinstance(policy, SparsePolicyMixin)
+    assert isinstance(policy, BaseSparsePolicy)
     return policy
 
 
@@ -117,7 +117,7 @@ def sparsity_of(model: BaseAlgorithm) -> dict[str, float]:
     :raises UnsupportedError: as :func:`sparsify`
     """
     policy = unwrapped(model.policy)
-    if isinstance(policy, SparsePolicyMixin):
+    if isinstance(policy, BaseSparsePolicy):
         sizes = {network.name: network.size for network in policy.sparse.networks}
         return policy.sparsity_config.by_network(sizes)
     return dict.fromkeys(_sparse_class(model).networks, 0.0)
@@ -137,7 +137,7 @@ def magnitude_mask(
     return mask
 
 
-def _sparse_class(model: BaseAlgorithm) -> type[SparsePolicyMixin]:
+def _sparse_class(model: BaseAlgorithm) -> type[BaseSparsePolicy]:
     """The sparse counterpart of a model's policy class."""
     supported = supported_algorithms()
     if not isinstance(model, tuple(supported.values())):
@@ -145,12 +145,12 @@ def _sparse_class(model: BaseAlgorithm) -> type[SparsePolicyMixin]:
             f"{type(model).__name__} has no sparse policy; supported are {', '.join(supported)}"
         )
     own = type(unwrapped(model.policy))
-    if issubclass(own, SparsePolicyMixin):
+    if issubclass(own, BaseSparsePolicy):
         return own
     aliases = model.policy_aliases
     for name, policy_class in aliases.items():
         if policy_class is own and (found := aliases.get(f"Sparse{name}")) is not None:
-            assert issubclass(found, SparsePolicyMixin)
+            assert issubclass(found, BaseSparsePolicy)
             return found
     names = [name for name in aliases if f"Sparse{name}" in aliases]
     raise UnsupportedError(
@@ -198,9 +198,9 @@ def _pruned(model: BaseAlgorithm, data: Mapping[str, Any], saved: State) -> Stat
     return state
 
 
-def _masked_policy(data: Mapping[str, Any]) -> SparsePolicyMixin:
+def _masked_policy(data: Mapping[str, Any]) -> BaseSparsePolicy:
     """A new policy of the twin's kind, on the CPU and with masks."""
-    policy_class: type[SparsePolicyMixin] = data["policy_class"]
+    policy_class: type[BaseSparsePolicy] = data["policy_class"]
     kwargs = {**copy.deepcopy(data["policy_kwargs"]), "compute": "masked"}
     if data["use_sde"]:
         kwargs["use_sde"] = True

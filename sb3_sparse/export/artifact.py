@@ -28,8 +28,8 @@ from sb3_sparse.export.npz import write_npz
 from sb3_sparse.export.observations import Observations, count_of, row_of
 from sb3_sparse.export.parity import Actor, ParityError
 from sb3_sparse.export.units import sort_units
+from sb3_sparse.policies.base import BaseSparsePolicy
 from sb3_sparse.policies.compiled import unwrapped
-from sb3_sparse.policies.mixin import SparsePolicyMixin
 from sb3_sparse.policies.saving import load_without_buffer
 
 COMPILERS = ("cc", "gcc", "clang")
@@ -137,7 +137,7 @@ def dense_artifact(model: BaseAlgorithm, normalised: bool) -> Artifact:
             "VecNormalize.load, as before"
         )
     policy = unwrapped(model.policy)
-    if isinstance(policy, SparsePolicyMixin) and policy.sparse.weight_decay:
+    if isinstance(policy, BaseSparsePolicy) and policy.sparse.weight_decay:
         notes.append("weight_decay, which is of sparse policies, is left out")
     return Artifact({".zip": content}, actor, tuple(notes))
 

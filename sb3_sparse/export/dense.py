@@ -16,9 +16,9 @@ from stable_baselines3.common.save_util import is_json_serializable
 
 from sb3_sparse.errors import UnsupportedError
 from sb3_sparse.export.pathless import pickled
+from sb3_sparse.policies.base import BaseSparsePolicy
 from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.policies.config import SparsityConfig
-from sb3_sparse.policies.mixin import SparsePolicyMixin
 from sb3_sparse.policies.named import import_named
 from sb3_sparse.policies.saving import parts_of
 
@@ -60,7 +60,7 @@ def write_dense(model: BaseAlgorithm) -> bytes:
 
 def _stock_class(policy: type[BasePolicy]) -> type[BasePolicy]:
     """What a sparse policy class makes sparse; any other class itself."""
-    if not issubclass(policy, SparsePolicyMixin):
+    if not issubclass(policy, BaseSparsePolicy):
         return policy
     for cls in policy.__mro__:
         if cls.__module__.startswith(STOCK):
@@ -79,7 +79,7 @@ def _stock_kwargs(policy: BasePolicy, kwargs: dict[str, Any]) -> dict[str, Any]:
     sparse = {*SparsityConfig.__dataclass_fields__, "weight_decay"}
     stock = {name: value for name, value in kwargs.items() if name not in sparse}
     import_named(stock)
-    if isinstance(policy, SparsePolicyMixin):  # which may have another by default
+    if isinstance(policy, BaseSparsePolicy):  # which may have another by default
         stock["features_extractor_class"] = policy.features_extractor_class
     return stock
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,6 @@ import torch as th
 from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.distributions import StateDependentNoiseDistribution
 from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
@@ -19,8 +19,8 @@ from sb3_sparse.export.nodes import Affine, Argmax, Clip, Linear, Positive
 from sb3_sparse.export.preprocess import observed, preprocessed
 from sb3_sparse.export.trace import Tracer
 from sb3_sparse.loading.zips import check_finite
-from sb3_sparse.policies.aliases import supported_algorithms
 from sb3_sparse.policies.compiled import unwrapped
+from sb3_sparse.policies.registry import sparse_counterpart, supported_algorithms
 
 
 def graph_of(model: BaseAlgorithm, normalization: VecNormalize | None) -> Graph:
@@ -31,24 +31,30 @@ def graph_of(model: BaseAlgorithm, normalization: VecNormalize | None) -> Graph:
     :raises UnsupportedError: for a network or space that cannot be exported
     """
     policy: Any = unwrapped(model.policy)
+    sparse = sparse_counterpart(policy)
+    if sparse is None:
+        raise UnsupportedError(f"{type(policy).__name__} is not known, so it cannot be exported")
     policy.set_training_mode(False)
     space = model.observation_space
     seen = observed(space)
     tracer = Tracer(seen.shape, {id(module): name for name, module in policy.named_modules()})
     value = preprocessed(tracer, space, normalization, policy.normalize_images)
     try:
-        extractor, *modules = _modules(policy)
+        extractor, *modules = map(policy.get_submodule, sparse.acting)
     except AttributeError as error:
         raise UnsupportedError(
             f"{type(policy).__name__} is not built as SB3's own policies are ({error}), so it "
             "cannot be exported"
         ) from error
+    if policy.squash_output and not _ends_in_tanh(modules[-1]):  # but its distribution squashes
+        modules.append(nn.Tanh())
     result = tracer.walk(extractor, value)
     for module in modules:
         result = tracer.walk(module, result)
     action = model.action_space
-    if _quantiles(policy):
-        result = _mean_quantiles(tracer, result, _quantiles(policy))
+    if sparse.acting_quantiles:
+        quantiles = attrgetter(sparse.acting_quantiles)(policy)
+        result = _mean_quantiles(tracer, result, quantiles)
     if isinstance(action, spaces.Box):
         _box(tracer, result, policy, action)
     elif isinstance(action, spaces.Discrete):
@@ -91,35 +97,8 @@ def check_model(model: BaseAlgorithm) -> None:
             )
 
 
-def _modules(policy: Any) -> list[nn.Module]:
-    """What an observation goes through, by kind of policy."""
-    if hasattr(policy, "q_net"):
-        return [policy.q_net.features_extractor, policy.q_net.q_net]
-    if hasattr(policy, "quantile_net"):
-        return [policy.quantile_net.features_extractor, policy.quantile_net.quantile_net]
-    if hasattr(policy, "action_net"):
-        return [
-            policy.pi_features_extractor,
-            policy.mlp_extractor.policy_net,
-            policy.action_net,
-            *([nn.Tanh()] if _squashed(policy.action_dist) else []),
-        ]
-    actor = policy.actor
-    if hasattr(actor, "latent_pi"):
-        return [actor.features_extractor, actor.latent_pi, actor.mu, nn.Tanh()]
-    return [actor.features_extractor, actor.mu]  # TD3 ends in its own tanh
-
-
-def _squashed(distribution: Any) -> bool:
-    """Whether an on-policy actor's distribution squashes its mean."""
-    return (
-        isinstance(distribution, StateDependentNoiseDistribution)
-        and distribution.bijector is not None
-    )
-
-
-def _quantiles(policy: Any) -> int:
-    return int(policy.quantile_net.n_quantiles) if hasattr(policy, "quantile_net") else 0
+def _ends_in_tanh(module: nn.Module) -> bool:
+    return isinstance([*module.modules()][-1], nn.Tanh)
 
 
 def _mean_quantiles(tracer: Tracer, value: int, quantiles: int) -> int:

@@ -7,17 +7,18 @@ from collections.abc import Mapping
 from typing import Any
 
 import torch as th
+from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.distributions import DiagGaussianDistribution, Distribution
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, NatureCNN
 
 from sb3_sparse.errors import UnsupportedError
 from sb3_sparse.policies.acting import Actions
-from sb3_sparse.policies.extractors import with_extractor
-from sb3_sparse.policies.mixin import SparsePolicyMixin
+from sb3_sparse.policies.base import BaseSparsePolicy
+from sb3_sparse.policies.registry import register_policy, with_extractor
 from sb3_sparse.policies.sampling import QuickCategorical, QuickGaussian, quick
 from sb3_sparse.policies.shortcut import Shortcut, untouched
-from sb3_sparse.policies.spec import NetworkSpec
+from sb3_sparse.policies.spec import NetworkSpec, PassCounts
 
 ACTOR = ("mlp_extractor.policy_net", "action_net")
 CRITIC = ("mlp_extractor.value_net", "value_net")
@@ -27,9 +28,17 @@ class NoSuchPart(UnsupportedError, AttributeError):
     """Another algorithm's policy has the attribute, and a sparse one has not."""
 
 
-class SparseActorCriticPolicy(SparsePolicyMixin, ActorCriticPolicy):
+def on_policy_passes(model: Any) -> list[PassCounts]:
+    """The passes of a gradient step of PPO and A2C."""
+    return [PassCounts(name, 1, 1, shares=False) for name in ("actor", "critic")]
+
+
+@register_policy(PPO, passes=on_policy_passes, told_by="clip_range")
+@register_policy(A2C, passes=on_policy_passes)
+class SparseActorCriticPolicy(BaseSparsePolicy, ActorCriticPolicy):
     """Sparse actor and value network for PPO, A2C and TRPO; a shared extractor is the actor's."""
 
+    acting = ("pi_features_extractor", *ACTOR)
     networks = {
         "actor": NetworkSpec(
             roots=("pi_features_extractor", "mlp_extractor.policy_net", "action_net"),

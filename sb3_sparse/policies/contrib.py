@@ -3,32 +3,41 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
+from importlib.util import find_spec
+from typing import Any, NoReturn
 
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, NatureCNN
 from stable_baselines3.common.type_aliases import Schedule
 
-from sb3_sparse.errors import MissingExtra
+from sb3_sparse.errors import MissingExtra, UnsupportedError
 from sb3_sparse.policies.acting import Actions
+from sb3_sparse.policies.actor_critic import SparseActorCriticPolicy
+from sb3_sparse.policies.base import BaseSparsePolicy
 from sb3_sparse.policies.critics import SparseCritic, SparseCriticsMixin
-from sb3_sparse.policies.extractors import with_extractor
 from sb3_sparse.policies.gaussian import GaussianActor
-from sb3_sparse.policies.mixin import SparsePolicyMixin
 from sb3_sparse.policies.parts import ActingPart, ActsByPart
-from sb3_sparse.policies.sac import GAUSSIAN_ACTOR, TWIN_CRITIC
-from sb3_sparse.policies.spec import NetworkSpec
+from sb3_sparse.policies.registry import (
+    register_policy,
+    reject,
+    supported_algorithms,
+    with_extractor,
+)
+from sb3_sparse.policies.sac import GAUSSIAN_ACTING, GAUSSIAN_ACTOR, TWIN_CRITIC, sac_passes
+from sb3_sparse.policies.spec import NetworkSpec, PassCounts, value_passes
 
-try:
+if find_spec("sb3_contrib") is None:
+    raise MissingExtra("a sparse policy of TQC, QRDQN, CrossQ or TRPO", "contrib")
+else:
+    from sb3_contrib import ARS, QRDQN, TQC, TRPO, CrossQ, MaskablePPO, RecurrentPPO
     from sb3_contrib.common.torch_layers import BatchRenorm1d
     from sb3_contrib.crossq.policies import Actor as CrossQActor
     from sb3_contrib.crossq.policies import CrossQCritic, CrossQPolicy
     from sb3_contrib.qrdqn.policies import QRDQNPolicy, QuantileNetwork
     from sb3_contrib.tqc.policies import Actor as TQCActor
     from sb3_contrib.tqc.policies import Critic, TQCPolicy
-except ImportError as error:
-    raise MissingExtra("a sparse policy of TQC, QRDQN, CrossQ or TRPO", "contrib") from error
 
 
 class SparseTQCActor(GaussianActor, TQCActor):
@@ -39,9 +48,11 @@ class SparseTQCCritic(SparseCritic, Critic):
     """Quantile critic of TQC."""
 
 
+@register_policy(TQC, passes=sac_passes)
 class SparseTQCPolicy(SparseCriticsMixin, TQCPolicy):
     """Sparse actor and quantile critics for TQC."""
 
+    acting = GAUSSIAN_ACTING
     actor_class = SparseTQCActor
     critic_class = SparseTQCCritic
     networks = {"actor": GAUSSIAN_ACTOR, "critic": TWIN_CRITIC}
@@ -74,10 +85,13 @@ class SparseQuantileNetwork(ActingPart, QuantileNetwork):
         return best
 
 
-class SparseQRDQNPolicy(ActsByPart, SparsePolicyMixin, QRDQNPolicy):
+@register_policy(QRDQN, passes=value_passes("quantile_net"))
+class SparseQRDQNPolicy(ActsByPart, BaseSparsePolicy, QRDQNPolicy):
     """Sparse quantile network for QR-DQN."""
 
-    acting = "quantile_net"
+    acting = ("quantile_net.features_extractor", "quantile_net.quantile_net")
+    acting_quantiles = "quantile_net.n_quantiles"
+    action_spaces = (spaces.Discrete,)
     quantile_net: SparseQuantileNetwork
     networks = {
         "quantile_net": NetworkSpec(
@@ -130,9 +144,22 @@ class SparseCrossQCritic(SparseCritic, CrossQCritic):
     """Critic of CrossQ."""
 
 
+def crossq_passes(model: Any) -> list[PassCounts]:
+    """The passes of a gradient step of CrossQ."""
+    share = 1 / model.policy_delay
+    return [
+        PassCounts("actor", 1),
+        PassCounts("critic", 2, 2),  # observations and next ones in one minibatch
+        PassCounts("actor", share, share),
+        PassCounts("critic", share, through=share),
+    ]
+
+
+@register_policy(CrossQ, passes=crossq_passes)
 class SparseCrossQPolicy(SparseCriticsMixin, CrossQPolicy):
     """Sparse actor and critics for CrossQ, which has no target network."""
 
+    acting = GAUSSIAN_ACTING
     actor_class = SparseCrossQActor
     critic_class = SparseCrossQCritic
     networks = {
@@ -150,3 +177,26 @@ class SparseCrossQPolicy(SparseCriticsMixin, CrossQPolicy):
 
 
 SparseCrossQMlpPolicy = with_extractor(SparseCrossQPolicy, "Mlp", FlattenExtractor)
+
+
+register_policy(TRPO, told_by="cg_max_steps")(SparseActorCriticPolicy)
+
+
+class _NoSparsePolicy(BasePolicy):
+    """Stands in for the sparse policy of an algorithm that has none, and says so."""
+
+    algorithm: str
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        raise UnsupportedError(
+            f"{self.algorithm} has no sparse policy; supported are "
+            f"{', '.join(supported_algorithms())}"
+        )
+
+    def _predict(self, observation: Any, deterministic: bool = False) -> NoReturn:
+        raise AssertionError("never built")
+
+
+for _algorithm in (ARS, MaskablePPO, RecurrentPPO):
+    _name = _algorithm.__name__
+    reject(_algorithm, type(f"No{_name}Policy", (_NoSparsePolicy,), {"algorithm": _name}))

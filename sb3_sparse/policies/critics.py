@@ -7,11 +7,12 @@ from contextlib import contextmanager
 from typing import Any, ClassVar
 
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.policies import ContinuousCritic
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
-from sb3_sparse.policies.mixin import SparsePolicyMixin
+from sb3_sparse.policies.base import BaseSparsePolicy
 from sb3_sparse.policies.parts import ActingPart, ActsByPart, SparsePart
 
 
@@ -51,10 +52,10 @@ class SparseContinuousCritic(SparseCritic, ContinuousCritic):
             return super().q1_forward(obs, actions)
 
 
-class SparseCriticsMixin(ActsByPart, SparsePolicyMixin):
+class SparseCriticsMixin(ActsByPart, BaseSparsePolicy):
     """What the policies of SAC, TD3, DDPG, TQC and CrossQ have in common."""
 
-    acting = "actor"
+    action_spaces = (spaces.Box,)
     actor_class: ClassVar[type[ActingPart]]
     critic_class: ClassVar[type[SparseCritic]] = SparseContinuousCritic
     actor_kwargs: dict[str, Any]

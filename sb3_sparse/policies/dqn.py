@@ -5,14 +5,16 @@ from __future__ import annotations
 from typing import Any
 
 import torch as th
+from gymnasium import spaces
+from stable_baselines3 import DQN
 from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, NatureCNN
 from stable_baselines3.dqn.policies import DQNPolicy, QNetwork
 
 from sb3_sparse.policies.acting import Actions
-from sb3_sparse.policies.extractors import with_extractor
-from sb3_sparse.policies.mixin import SparsePolicyMixin
+from sb3_sparse.policies.base import BaseSparsePolicy
 from sb3_sparse.policies.parts import ActingPart, ActsByPart
-from sb3_sparse.policies.spec import NetworkSpec
+from sb3_sparse.policies.registry import register_policy, with_extractor
+from sb3_sparse.policies.spec import NetworkSpec, value_passes
 
 
 class SparseQNetwork(ActingPart, QNetwork):
@@ -31,10 +33,12 @@ class SparseQNetwork(ActingPart, QNetwork):
         return best
 
 
-class SparseDQNPolicy(ActsByPart, SparsePolicyMixin, DQNPolicy):
+@register_policy(DQN, passes=value_passes("q_net"))
+class SparseDQNPolicy(ActsByPart, BaseSparsePolicy, DQNPolicy):
     """Sparse Q network for DQN."""
 
-    acting = "q_net"
+    acting = ("q_net.features_extractor", "q_net.q_net")
+    action_spaces = (spaces.Discrete,)
     q_net: SparseQNetwork
     networks = {
         "q_net": NetworkSpec(

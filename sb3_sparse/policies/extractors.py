@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import copy
-from typing import Any, TypeVar
+from typing import Any
 
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.torch_layers import (
     BaseFeaturesExtractor,
@@ -19,7 +18,6 @@ from torch import nn
 
 from sb3_sparse.errors import UnsupportedError
 
-Policy = TypeVar("Policy", bound=BasePolicy)
 SUPPORTED = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary, spaces.Dict)
 
 
@@ -56,20 +54,3 @@ def copied_modules(value: Any, memo: dict[int, Any] | None = None) -> Any:
     if type(value) in (list, tuple):
         return type(value)(copied_modules(entry, memo) for entry in value)
     return value
-
-
-def with_extractor(
-    policy: type[Policy], prefix: str, extractor: type[BaseFeaturesExtractor]
-) -> type[Policy]:
-    """A subclass of ``policy`` with another default features extractor.
-
-    :param prefix: what to put between the class name and ``Policy``, e.g. ``"Cnn"``; the module
-        must bind the class to that name, or it cannot be pickled
-    """
-    name = policy.__name__.removesuffix("Policy") + prefix + "Policy"
-    members = {
-        "__module__": policy.__module__,
-        "__doc__": f"{policy.__name__} with {extractor.__name__} by default.",
-        "extractor_class": extractor,
-    }
-    return type(name, (policy,), members)

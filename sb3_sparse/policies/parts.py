@@ -110,16 +110,19 @@ class ActingPart(SparsePart, Acts):
 class ActsByPart(Acts):
     """A policy one part of which predicts."""
 
-    acting: ClassVar[str]
-    """Name of the part."""
+    acting: ClassVar[tuple[str, ...]]
+
+    @property
+    def _acting_part(self) -> nn.Module:
+        return self._modules[self.acting[0].partition(".")[0]]  # type: ignore[return-value]
 
     def use_kernels(self) -> None:
-        part = unwrapped(self.get_submodule(self.acting))
+        part = unwrapped(self._acting_part)
         assert isinstance(part, ActingPart)
         part.use_kernels()
 
     def _choose(self, observations: Actions, deterministic: bool) -> Actions | None:
-        part = self._modules[self.acting]
+        part = self._acting_part
         return part._choose(observations, deterministic) if isinstance(part, ActingPart) else None
 
 

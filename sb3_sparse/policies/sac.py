@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+from stable_baselines3 import SAC
 from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, NatureCNN
 from stable_baselines3.sac.policies import Actor, SACPolicy
 
 from sb3_sparse.policies.critics import SparseCriticsMixin
-from sb3_sparse.policies.extractors import with_extractor
 from sb3_sparse.policies.gaussian import GaussianActor
-from sb3_sparse.policies.spec import NetworkSpec
+from sb3_sparse.policies.registry import register_policy, with_extractor
+from sb3_sparse.policies.spec import NetworkSpec, PassCounts
 
 GAUSSIAN_ACTOR = NetworkSpec(
     roots=("actor",),
@@ -16,6 +19,7 @@ GAUSSIAN_ACTOR = NetworkSpec(
     heads=("actor.mu", "actor.log_std"),
     owner="actor",
 )
+GAUSSIAN_ACTING = ("actor.features_extractor", "actor.latent_pi", "actor.mu")
 TWIN_CRITIC = NetworkSpec(
     roots=("critic",),
     trunks=("critic.qf*",),
@@ -29,9 +33,21 @@ class SparseSACActor(GaussianActor, Actor):
     """Actor of SAC."""
 
 
+def sac_passes(model: Any) -> list[PassCounts]:
+    """The passes of a gradient step of SAC and TQC."""
+    return [
+        PassCounts("actor", 2, 1),  # of the observations, and of the next ones
+        PassCounts("critic", 1, 1),
+        PassCounts("critic", 1, through=1),  # of the actor's actions
+        PassCounts("critic", 1, target=True),
+    ]
+
+
+@register_policy(SAC, passes=sac_passes)
 class SparseSACPolicy(SparseCriticsMixin, SACPolicy):
     """Sparse actor and critics for SAC."""
 
+    acting = GAUSSIAN_ACTING
     actor_class = SparseSACActor
     networks = {"actor": GAUSSIAN_ACTOR, "critic": TWIN_CRITIC}
 

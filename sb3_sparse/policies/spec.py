@@ -1,10 +1,11 @@
-"""Where a policy class keeps its networks."""
+"""What a policy class declares of its networks."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
+from typing import Any
 
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
@@ -31,6 +32,34 @@ class NetworkSpec:
     heads: tuple[str, ...]
     target: str | None = None
     owner: str = ""
+
+
+@dataclass(frozen=True)
+class PassCounts:
+    """Passes of one network in one gradient step, on average, for each sample of the minibatch.
+
+    :param network: its name
+    :param forward: forward passes
+    :param backward: backward passes that give the gradient of its weights; each costs 2 forward
+    :param through: backward passes that only hand a gradient on to the network's actions; each
+        costs 1 forward, without the features extractor
+    :param target: whether they go through the target copy
+    :param leaves_out: name pattern of layers that they do not go through
+    :param shares: whether they go through layers again that another network shares
+    """
+
+    network: str
+    forward: float = 1.0
+    backward: float = 0.0
+    through: float = 0.0
+    target: bool = False
+    leaves_out: str = ""
+    shares: bool = True
+
+
+def value_passes(network: str) -> Callable[[Any], list[PassCounts]]:
+    """The passes of a gradient step of DQN and QR-DQN."""
+    return lambda model: [PassCounts(network, 1, 1), PassCounts(network, 1, target=True)]
 
 
 @dataclass

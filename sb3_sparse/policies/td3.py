@@ -5,15 +5,16 @@ from __future__ import annotations
 from typing import Any
 
 import torch as th
+from stable_baselines3 import DDPG, TD3
 from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, NatureCNN
 from stable_baselines3.td3.policies import Actor, TD3Policy
 
 from sb3_sparse.policies.acting import Actions
 from sb3_sparse.policies.critics import SparseCriticsMixin
-from sb3_sparse.policies.extractors import with_extractor
 from sb3_sparse.policies.parts import ActingPart
+from sb3_sparse.policies.registry import register_policy, with_extractor
 from sb3_sparse.policies.sac import TWIN_CRITIC
-from sb3_sparse.policies.spec import NetworkSpec
+from sb3_sparse.policies.spec import NetworkSpec, PassCounts
 
 
 class SparseTD3Actor(ActingPart, Actor):
@@ -31,9 +32,25 @@ class SparseTD3Actor(ActingPart, Actor):
         return results[0]
 
 
+def td3_passes(model: Any) -> list[PassCounts]:
+    """The passes of a gradient step of TD3 and DDPG."""
+    share = 1 / model.policy_delay
+    first = "critic.qf[!0]*"  # the actor's loss takes the first critic alone
+    return [
+        PassCounts("actor", 1, target=True),
+        PassCounts("critic", 1, target=True),
+        PassCounts("critic", 1, 1),
+        PassCounts("actor", share, share),
+        PassCounts("critic", share, through=share, leaves_out=first),
+    ]
+
+
+@register_policy(TD3, passes=td3_passes)
+@register_policy(DDPG, passes=td3_passes)
 class SparseTD3Policy(SparseCriticsMixin, TD3Policy):
     """Sparse actor and critics for TD3 and DDPG."""
 
+    acting = ("actor.features_extractor", "actor.mu")
     actor_class = SparseTD3Actor
     networks = {
         "actor": NetworkSpec(

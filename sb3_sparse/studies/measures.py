@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from sb3_sparse.algorithms.table import trainer_of
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.sparsity.numeric import is_number, is_whole
 
@@ -58,11 +57,9 @@ class Measures:
         :raises ConfigError: and say which can
         """
         if "snr" in self.during:
-            from sb3_sparse.analysis.losses import LOSSES
+            from sb3_sparse.analysis.losses import losses_for
 
-            if trainer_of(algorithm) not in LOSSES:
-                known = ", ".join(one.__name__ for one in LOSSES)
-                raise ConfigError(f"snr is measured of {known}, got {algorithm.__name__}")
+            losses_for(algorithm)
 
     def callbacks(self, folder: Path) -> list[Any]:
         """New callbacks that write into a run's folder."""

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from numbers import Integral, Real
 from typing import Any
 
+from sb3_sparse.policies.registry import lineage
+
 
 @dataclass(frozen=True)
 class Kind:
@@ -240,7 +242,8 @@ def kind_of(algo: str, name: str) -> Kind | None:
     :param algo: algorithm, e.g. ``"sac"``
     :param name: of the algorithm's, its policy's or rl-zoo's argument; these do not overlap
     """
-    for table in (OF_ONE.get(algo, {}), ALGORITHM, ZOO, POLICY):
+    of_one = (OF_ONE.get(name, {}) for name in lineage(algo))
+    for table in (*of_one, ALGORITHM, ZOO, POLICY):
         if name in table:
             return table[name]
     return None

@@ -18,8 +18,8 @@ from sb3_sparse.algorithms.training import Fused
 from sb3_sparse.engine.native.library import in_use, why_missing
 from sb3_sparse.errors import CorruptStateError
 from sb3_sparse.loading.guard import reading
+from sb3_sparse.policies.base import BaseSparsePolicy
 from sb3_sparse.policies.compiled import unwrapped
-from sb3_sparse.policies.mixin import SparsePolicyMixin
 from sb3_sparse.policies.report import COMPUTES, SPARSE
 from sb3_sparse.zoo.record import CURE, NAME, WHAT
 
@@ -90,7 +90,7 @@ def computing_at(model: BaseAlgorithm, record: Mapping[str, Any], folder: Path) 
     :param folder: of the run
     """
     policy = unwrapped(model.policy)
-    assert isinstance(policy, SparsePolicyMixin)
+    assert isinstance(policy, BaseSparsePolicy)
     known = computing_in(record, folder)
     now = Sitting(
         model.num_timesteps,

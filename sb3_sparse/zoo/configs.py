@@ -104,6 +104,7 @@ def entry_of(path: Path, env_id: str, atari: bool) -> dict[str, Any]:
 
 def evaluation_of(algo: str, env_id: str, atari: bool) -> dict[str, int]:
     """How a run is evaluated: ``eval_freq`` (environment steps) and ``eval_episodes``."""
-    suite = _read(config_root() / "evaluation.yml")[algo]
+    suites = _read(config_root() / "evaluation.yml")
+    suite = suites.get(algo, suites["default"])
     shared = "atari" if atari else "default"
     return {name: int(value) for name, value in suite.get(env_id, suite[shared]).items()}

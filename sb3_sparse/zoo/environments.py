@@ -10,6 +10,7 @@ from typing import Any
 import gymnasium as gym
 
 from sb3_sparse.errors import ConfigError, MissingExtra, did_you_mean
+from sb3_sparse.policies.registry import registered
 
 
 def register_atari() -> bool:
@@ -23,16 +24,16 @@ def register_atari() -> bool:
 
 
 def package_names(given: Any) -> tuple[str, ...]:
-    """Names of packages that register environments, as ``--gym-packages`` and files give them.
+    """Names of packages that register environments or algorithms.
 
-    :param given: a name, a list of names, or None
+    :param given: as ``--gym-packages`` and files give them: a name, a list of names, or None
     :raises ConfigError: if it is something else
     """
     names = [given] if isinstance(given, str) else [] if given is None else given
     if not isinstance(names, (list, tuple)) or not all(_is_module(name) for name in names):
         raise ConfigError(
-            "gym_packages must be names of modules that register environments, e.g. my_envs or "
-            f"my_envs.maze (no path of a file), got {given!r}"
+            "gym_packages must be names of modules that register environments or algorithms, e.g. "
+            f"my_envs or my_envs.maze (no path of a file), got {given!r}"
         )
     return tuple(dict.fromkeys(names))
 
@@ -62,14 +63,13 @@ def plain_id(env_id: str, packages: Sequence[str] = ()) -> tuple[str, tuple[str,
 
 
 def import_packages(names: Iterable[str]) -> None:
-    """Import packages, so that they register their environments.
+    """Import packages, so that they register their environments and algorithms.
 
     :raises ConfigError: if one is not there, or fails
     """
     for name in names:
         # The user's code may name SparsePolicy, whose registration the command line puts off.
-        import sb3_sparse.policies.aliases  # noqa: F401
-
+        registered()
         try:
             importlib.import_module(name)
         except ModuleNotFoundError as error:
@@ -78,8 +78,8 @@ def import_packages(names: Iterable[str]) -> None:
             root = Path(name.partition(".")[0])
             here = root.is_dir() or root.with_suffix(".py").is_file()
             raise ConfigError(
-                f"there is no package {name!r} to import environments from; install it, or put "
-                "the folder that it lies in on PYTHONPATH"
+                f"there is no package {name!r} to import environments or algorithms from; install "
+                "it, or put the folder that it lies in on PYTHONPATH"
                 + (" (it lies in this one: PYTHONPATH=. before the command)" if here else "")
             ) from error
         except Exception as error:

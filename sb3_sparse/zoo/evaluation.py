@@ -20,8 +20,8 @@ from sb3_sparse.loading.arrays import read_arrays
 from sb3_sparse.loading.guard import reading
 from sb3_sparse.loading.text import read_json
 from sb3_sparse.loading.zips import read_model
+from sb3_sparse.policies.base import BaseSparsePolicy
 from sb3_sparse.policies.compiled import unwrapped
-from sb3_sparse.policies.mixin import SparsePolicyMixin
 from sb3_sparse.zoo.divergence import check_networks, check_return
 from sb3_sparse.zoo.watch import Watch
 
@@ -184,7 +184,7 @@ class Evaluation(EvalCallback):
 
     def _evaluate(self) -> bool:
         policy = unwrapped(self.model.policy)
-        assert isinstance(policy, SparsePolicyMixin)
+        assert isinstance(policy, BaseSparsePolicy)
         if not any(network.denser for network in policy.sparse.networks):
             return super()._on_step()
         kept, self.best_model_save_path = self.best_model_save_path, None

@@ -193,11 +193,11 @@ def spaces_of(
     return envs.observation_space, envs.action_space
 
 
-def loadable_algorithms() -> list[str]:
-    """Names of the algorithms that rl-zoo knows, those without a sparse policy too."""
-    return list(ALGOS)
+def loadable_algorithms() -> dict[str, type[BaseAlgorithm]]:
+    """Algorithms that a run can be of, those of rl-zoo without a sparse policy too."""
+    return {**ALGOS, **algorithms()}
 
 
 def load_for_prediction(algo: str, path: Path) -> BaseAlgorithm:
     """A saved model without its replay buffer."""
-    return load_without_buffer({**ALGOS, **algorithms()}[algo], path)
+    return load_without_buffer(loadable_algorithms()[algo], path)

@@ -13,8 +13,8 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.preprocessing import is_image_space
 
 from sb3_sparse.errors import ConfigError
-from sb3_sparse.policies.aliases import SparsePolicy
-from sb3_sparse.policies.mixin import SparsePolicyMixin
+from sb3_sparse.policies.base import BaseSparsePolicy
+from sb3_sparse.policies.registry import SparsePolicy
 from sb3_sparse.sparsity.widths import equivalent_widths
 
 EXTRACTOR = "features_extractor_class"
@@ -86,14 +86,14 @@ def untrained_policy(
     observation_space: spaces.Space[Any],
     action_space: spaces.Space[Any],
     settings: Mapping[str, Any],
-) -> SparsePolicyMixin:
+) -> BaseSparsePolicy:
     """A policy as the algorithm would make it from these settings, to be looked at."""
     kwargs = deepcopy(dict(settings["policy_kwargs"]))
     if settings.get("use_sde"):
         kwargs["use_sde"] = True
     policy_class: Any = algorithm.policy_aliases[SparsePolicy]
     policy = policy_class(observation_space, action_space, BasePolicy._dummy_schedule, **kwargs)
-    assert isinstance(policy, SparsePolicyMixin)
+    assert isinstance(policy, BaseSparsePolicy)
     return policy
 
 

@@ -14,8 +14,8 @@ from sb3_sparse.engine.masked import MaskedStorage
 from sb3_sparse.engine.prunable import Prunable
 from sb3_sparse.engine.storage import LayerStorage
 from sb3_sparse.errors import ConfigError, CorruptStateError
-from sb3_sparse.policies.aliases import SparsePolicy, supported_algorithms
 from sb3_sparse.policies.compiled import plain_names
+from sb3_sparse.policies.registry import registered
 from sb3_sparse.policies.report import LayerReport, SparsityReport, compute_of
 from sb3_sparse.policies.spec import NetworkSpec
 from sb3_sparse.zoo.positions import positions_of
@@ -102,9 +102,8 @@ def outline_of(state: Mapping[str, Any], image: tuple[int, ...] | None, where: s
 
 def _specs(state: Mapping[str, Any]) -> Mapping[str, NetworkSpec]:
     """The networks of the first algorithm whose policy keeps its layers where the state does."""
-    for algorithm in supported_algorithms().values():
-        policy: Any = algorithm.policy_aliases[SparsePolicy]
-        specs: Mapping[str, NetworkSpec] = policy.networks
+    for one in registered().values():
+        specs = one.policy.networks
         if all(any(_below(key, spec.roots) for key in state) for spec in specs.values()):
             return specs
     return {}

@@ -13,6 +13,7 @@ import torch as th
 from gymnasium import spaces
 
 from sb3_sparse.errors import ConfigError, MissingExtra, SparsityError, Unwritable
+from sb3_sparse.policies.registry import registered
 from sb3_sparse.zoo.disk import refusal
 from sb3_sparse.zoo.manager import spaces_of
 from sb3_sparse.zoo.match import Match, match_parameters, untrained_policy
@@ -140,15 +141,13 @@ def check_action_space(run: RunSpec, space: spaces.Space[Any]) -> None:
 
     :raises ConfigError: if so
     """
-    discrete = isinstance(space, spaces.Discrete)
-    discrete_only = run.algo in ("dqn", "qrdqn")
-    box_only = run.algo in ("sac", "td3", "ddpg", "tqc", "crossq")
-    if (discrete_only and not discrete) or (box_only and not isinstance(space, spaces.Box)):
-        others = (
-            "dqn, qrdqn, ppo, a2c or trpo"
-            if discrete
-            else "sac, td3, ddpg, tqc, crossq, ppo, a2c or trpo"
-        )
+    able = [
+        name.lower()
+        for name, one in registered().items()
+        if isinstance(space, one.policy.action_spaces)
+    ]
+    if run.algo not in able:
         raise ConfigError(
-            f"{run.algo} cannot act in {run.env_id}, whose actions are {space}; take {others}"
+            f"{run.algo} cannot act in {run.env_id}, whose actions are {space}; "
+            + (f"take {' or '.join(able)}" if able else "no algorithm can")
         )

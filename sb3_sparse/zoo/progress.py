@@ -17,8 +17,8 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from sb3_sparse.policies.base import BaseSparsePolicy
 from sb3_sparse.policies.compiled import unwrapped
-from sb3_sparse.policies.mixin import SparsePolicyMixin
 from sb3_sparse.zoo.computing import gradient_steps_of
 from sb3_sparse.zoo.match import Match
 from sb3_sparse.zoo.watch import Watch
@@ -109,7 +109,7 @@ class TrainingProgress(Watch):
         self.planned = self.model._total_timesteps
         self.printed = 0
         policy = unwrapped(self.model.policy)
-        if isinstance(policy, SparsePolicyMixin):
+        if isinstance(policy, BaseSparsePolicy):
             sparse = [layer.is_sparse for layer in policy.sparse.layers]
             if any(sparse):
                 self.console.print(f"{sum(sparse)} of {len(sparse)} layers in sparse storage")
@@ -121,7 +121,7 @@ class TrainingProgress(Watch):
         returns = [float(episode["r"]) for episode in self.model.ep_info_buffer or ()]
         text = f"return {fmean(returns):.1f}" if returns else "return –"
         policy = unwrapped(self.model.policy)
-        if isinstance(policy, SparsePolicyMixin):
+        if isinstance(policy, BaseSparsePolicy):
             text += f", sparsity {policy.sparse.sparsity:.2%}"
         seconds = (time.time_ns() - self.model.start_time) / 1e9  # as SB3's own time/fps
         done = self.model.num_timesteps - self.model._num_timesteps_at_start

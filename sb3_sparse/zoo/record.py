@@ -13,7 +13,7 @@ from typing import Any
 from sb3_sparse.errors import ConfigError, CorruptStateError
 from sb3_sparse.files import written_whole
 from sb3_sparse.loading.text import read_json
-from sb3_sparse.policies.mixin import SparsePolicyMixin
+from sb3_sparse.policies.base import BaseSparsePolicy
 
 NAME = "sparsity.json"
 WHAT = "record of a run"
@@ -77,7 +77,7 @@ def versions() -> dict[str, str]:
     return found
 
 
-def sparsity_of(policy: SparsePolicyMixin) -> dict[str, Any]:
+def sparsity_of(policy: BaseSparsePolicy) -> dict[str, Any]:
     """Counts of a policy as it is now: in total, by network and layer by layer.
 
     ``wanted_nnz`` are the active connections that its settings ask for.

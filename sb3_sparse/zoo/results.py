@@ -15,8 +15,8 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
 from sb3_sparse.loading.guard import reading
+from sb3_sparse.policies.base import BaseSparsePolicy
 from sb3_sparse.policies.compiled import unwrapped
-from sb3_sparse.policies.mixin import SparsePolicyMixin
 from sb3_sparse.zoo.divergence import check_return
 from sb3_sparse.zoo.spec import RunSpec
 from sb3_sparse.zoo.watch import Watch, counting
@@ -72,9 +72,9 @@ class Outcome:
         return 1.0 - sum(one.final_nnz for one in layers) / sum(one.size for one in layers)
 
     @property
-    def _policy(self) -> SparsePolicyMixin:
+    def _policy(self) -> BaseSparsePolicy:
         policy = unwrapped(self.model.policy)
-        assert isinstance(policy, SparsePolicyMixin)
+        assert isinstance(policy, BaseSparsePolicy)
         return policy
 
 

@@ -9,15 +9,17 @@ from pathlib import Path
 from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_sparse.errors import ConfigError, CorruptStateError
 from sb3_sparse.loading.guard import reading
 from sb3_sparse.loading.zips import check_state, look_into, read_model
+from sb3_sparse.policies.registry import writers_of
 from sb3_sparse.policies.saving import differ
 from sb3_sparse.zoo.arguments import Kind, is_whole, kind_of
-from sb3_sparse.zoo.environments import package_names
+from sb3_sparse.zoo.environments import import_packages, package_names
 from sb3_sparse.zoo.folder import (
     ARGUMENTS,
     CONFIG,
@@ -33,18 +35,6 @@ from sb3_sparse.zoo.folder import (
 from sb3_sparse.zoo.manager import load_for_prediction, loadable_algorithms, quiet
 from sb3_sparse.zoo.spec import algorithms
 
-BY_POLICY = {
-    "DQNPolicy": "dqn",
-    "QRDQNPolicy": "qrdqn",
-    "SACPolicy": "sac",
-    "TQCPolicy": "tqc",
-    "CrossQPolicy": "crossq",
-    "TD3Policy": "td3",
-}
-"""Of the algorithms that have a policy class to themselves; DDPG is a TD3."""
-FOREIGN = ("Recurrent", "Maskable")
-"""Policies that inherit from PPO's and are of other algorithms."""
-ON_POLICY = ("ppo", "a2c", "trpo")
 COUNTED = (
     "num_timesteps",
     "_total_timesteps",
@@ -66,7 +56,7 @@ class Saved:
     :param vecnormalize: statistics that its observations were normalised by; None: they were not
     :param settings: how its environments were made, by the names of
         :data:`~sb3_sparse.zoo.folder.OF_ENVIRONMENT`; empty if it lies in no run
-    :param gym_packages: modules that register its environment
+    :param gym_packages: modules that register its environment or algorithm
     """
 
     path: Path
@@ -162,7 +152,8 @@ def find_saved(
     :param algo: None: as the run's folder or the file says
     :param env_id: None: as the run's folder says
     :param vecnormalize: statistics of a VecNormalize; None: those in the run's folder
-    :param gym_packages: modules that register environments, beside those that the run names
+    :param gym_packages: modules that register environments or algorithms, beside those that the run
+        names
     :raises ConfigError: if there is no model, or what belongs to it is missing
     :raises CorruptStateError: if one of the files is damaged
     """
@@ -172,6 +163,7 @@ def find_saved(
     arguments = arguments_of(folder) if path.is_dir() or is_run(folder) else {}
     env_id, packages = environment_in({**arguments, "env": env_id or arguments.get("env")})
     packages = package_names([*packages, *gym_packages])
+    import_packages(packages)
     params = params_of(folder, arguments["env"]) if arguments else None
     if path.is_dir():
         path = model_in(folder, arguments["env"], best)
@@ -226,7 +218,7 @@ def _check_lone(path: Path, algo: str) -> None:
                 f"{beside} lies beside {path}: give --vecnormalize {beside} if the observations of "
                 "this model were normalised by it, else move it elsewhere"
             )
-    if algo in ON_POLICY:
+    if issubclass(algorithms()[algo], OnPolicyAlgorithm):
         data, _ = read_model(path)
         if differ(data.get("_last_obs"), data.get("_last_original_obs")):
             raise ConfigError(
@@ -241,31 +233,30 @@ def _algo(path: Path, given: str | None, known: str | None) -> str:
     :raises ConfigError: if the one given is none, or not the file's
     """
     if given is None:
-        return known or algo_of(path)
+        return known or algos_of(path)[0]
     if given not in algorithms():
         raise ConfigError(f"unknown algorithm {given!r}; allowed are {', '.join(algorithms())}")
-    told = algo_of(path)
-    if given != told and {given, told} != {"td3", "ddpg"}:
-        raise ConfigError(f"{path} is a model of {told}, not of {given}; leave --algo out")
+    told = algos_of(path)
+    if given not in told:
+        raise ConfigError(f"{path} is a model of {told[0]}, not of {given}; leave --algo out")
     return given
 
 
-def algo_of(path: Path) -> str:
-    """The algorithm that a zip was saved by, told by its policy and attributes.
+def algos_of(path: Path) -> list[str]:
+    """The algorithms that may have saved a zip, told by its policy and attributes.
+
+    There are several where they share a policy class, as TD3 and DDPG do; the first is the
+    likeliest.
 
     :raises ConfigError: if it is no model, or of an algorithm that is not supported
     """
     data, _ = read_model(path)
     policy = data.get("policy_class")
-    names = [cls.__name__ for cls in policy.__mro__] if isinstance(policy, type) else []
-    foreign = any(name.startswith(FOREIGN) for name in names)
-    for name, algo in BY_POLICY.items():
-        if name in names:
-            return algo
-    if "ActorCriticPolicy" in names and not foreign:
-        on_policy = {"clip_range": "ppo", "cg_max_steps": "trpo"}
-        return next((algo for key, algo in on_policy.items() if key in data), "a2c")
-    raise ConfigError(
-        f"{path} has the policy {names[0] if names else policy!r}, which belongs to no supported "
-        f"algorithm; allowed are {', '.join(algorithms())}"
-    )
+    found = writers_of(policy, data) if isinstance(policy, type) else []
+    if not found:
+        named = policy.__name__ if isinstance(policy, type) else repr(policy)
+        raise ConfigError(
+            f"{path} has the policy {named}, which belongs to no supported algorithm; allowed are "
+            f"{', '.join(algorithms())}"
+        )
+    return [name.lower() for name in found]

@@ -63,7 +63,8 @@ def enjoy(
     :param best: of a folder, the best policy instead of the last
     :param video: record the first 1000 steps in a folder ``videos`` beside the zip
     :param seed: of the environment
-    :param gym_packages: modules that register environments, beside those that the run names
+    :param gym_packages: modules that register environments or algorithms, beside those that the run
+        names
     :param algo: None: as the run's folder or the file says
     :param env_id: None: as the run's folder says
     :param vecnormalize: statistics of a VecNormalize; None: those in the run's folder

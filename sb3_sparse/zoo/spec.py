@@ -12,7 +12,7 @@ import numpy as np
 
 from sb3_sparse.algorithms.table import algorithm_named
 from sb3_sparse.errors import ConfigError, did_you_mean
-from sb3_sparse.policies.names import algorithm_names
+from sb3_sparse.policies.registry import algorithm_names
 from sb3_sparse.sparsity.distributions import check_distribution, check_sparsity
 from sb3_sparse.zoo.arguments import MAPPING, Kind, is_whole
 from sb3_sparse.zoo.configs import config_path, entry_of, evaluation_of
@@ -61,8 +61,8 @@ class RunSpec:
     :param eval_freq: environment steps between two evaluations
     :param eval_episodes: episodes of one evaluation
     :param entry: settings in place of those that the config has for the environment
-    :param gym_packages: modules that register environments when they are imported, as rl-zoo's
-        ``--gym-packages``
+    :param gym_packages: modules that register environments or algorithms when they are imported,
+        as rl-zoo's ``--gym-packages``
     :raises ConfigError: for a name or value that is not allowed
     """
 
@@ -87,16 +87,17 @@ class RunSpec:
         for one in fields(self):  # NumPy's numbers, which no JSON takes, become Python's
             object.__setattr__(self, one.name, plain(getattr(self, one.name)))
         self._check_types()
-        known = [name.lower() for name in algorithm_names()]
-        if self.algo not in known:
-            raise ConfigError(
-                f"unknown algorithm {self.algo!r}{did_you_mean(self.algo, known)}; allowed are "
-                f"{', '.join(known)} (tqc, qrdqn, crossq and trpo need sb3-sparse[contrib])"
-            )
         env_id, packages = plain_id(self.env_id, package_names(self.gym_packages))
         object.__setattr__(self, "env_id", env_id)
         object.__setattr__(self, "gym_packages", packages)
         import_packages(packages)
+        known = [name.lower() for name in algorithm_names()]
+        if self.algo not in known:
+            raise ConfigError(
+                f"unknown algorithm {self.algo!r}{did_you_mean(self.algo, known)}; allowed are "
+                f"{', '.join(known)} (tqc, qrdqn, crossq and trpo need sb3-sparse[contrib]; "
+                "--gym-packages names a module that registers algorithms of your own)"
+            )
         known_environment(env_id)
         if self.sparsity is not None:
             check_sparsity(self.sparsity)

@@ -14,8 +14,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_sparse.errors import ConfigError, command
+from sb3_sparse.policies.base import BaseSparsePolicy
 from sb3_sparse.policies.compiled import unwrapped
-from sb3_sparse.policies.mixin import SparsePolicyMixin
 from sb3_sparse.zoo.checkpoint import (
     Checkpoints,
     StopTraining,
@@ -162,7 +162,7 @@ def _learn(
     after_evaluation: BaseCallback | None = None,
 ) -> Outcome:
     policy = unwrapped(model.policy)
-    assert isinstance(policy, SparsePolicyMixin)
+    assert isinstance(policy, BaseSparsePolicy)
     schedule = experiment.evaluation
     envs = experiment.evaluation_envs(
         min(EVALUATION_ENVS, schedule["eval_episodes"]), run.seed + 20_000

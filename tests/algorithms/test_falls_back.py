@@ -21,9 +21,9 @@ import sb3_sparse
 from sb3_sparse.engine.native import library
 from sb3_sparse.fused.errors import NotCovered
 from sb3_sparse.policies.actor_critic import SparseActorCriticPolicy
+from sb3_sparse.policies.base import BaseSparsePolicy
 from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.policies.dqn import SparseDQNPolicy
-from sb3_sparse.policies.mixin import SparsePolicyMixin
 from sb3_sparse.policies.sac import SparseSACPolicy
 
 
@@ -52,7 +52,7 @@ def assert_falls_back(name, why, change=lambda model: None, env=lambda: None, st
     ours, stock = models
     assert why in reason_of(ours)
     said = f"Gradient steps are Stable-Baselines3's own: {reason_of(ours)}"
-    assert ours.logger.heard == [said] * isinstance(unwrapped(ours.policy), SparsePolicyMixin)
+    assert ours.logger.heard == [said] * isinstance(unwrapped(ours.policy), BaseSparsePolicy)
     assert_alike(ours, stock, exact=True)
 
 

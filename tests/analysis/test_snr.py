@@ -32,7 +32,7 @@ def mean_gradients(model, batch, chunk):
     """Means of the per-sample gradients, by parameter."""
     twin, names, found = dense_twin(model.policy), parameters_by_network(model.policy), {}
     with own_randomness(1, model.device), th.no_grad():
-        losses = losses_for(model)(model, twin, batch)
+        losses = losses_for(type(model))(model, twin, batch)
     for loss in losses:
         trained = [name for network in loss.networks for name in names[network]]
         parts = list(per_sample_gradients(twin, loss, trained, chunk))

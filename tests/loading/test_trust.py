@@ -23,7 +23,7 @@ from sb3_sparse.errors import ConfigError, CorruptStateError
 from sb3_sparse.loading.zooyaml import NotBuilt, read_zoo_yaml
 from sb3_sparse.zoo.finetune import check_wrappers
 from sb3_sparse.zoo.inspection import inspect_model
-from sb3_sparse.zoo.saved import algo_of
+from sb3_sparse.zoo.saved import algos_of
 
 
 class Payload:
@@ -58,7 +58,7 @@ def test_inspect_runs_no_pickle_of_a_zip(tmp_path):
     assert str(inspect_model(tmp_path / "model.zip")) == before
     assert not (tmp_path / "ran").exists()
     with pytest.raises((ConfigError, CorruptStateError)):  # SB3's own way runs it
-        algo_of(tmp_path / "model.zip")
+        algos_of(tmp_path / "model.zip")
     assert (tmp_path / "ran").exists()
 
 

@@ -22,7 +22,7 @@ from sb3_sparse.errors import CorruptStateError
 from sb3_sparse.export import FORMATS, export
 from sb3_sparse.policies.compiled import plain_names, unwrapped
 from sb3_sparse.zoo.inspection import inspect_model
-from sb3_sparse.zoo.saved import algo_of
+from sb3_sparse.zoo.saved import algos_of
 
 pytestmark = pytest.mark.filterwarnings("error:Dynamo")
 """Torch compiles the modules, and never meets the kernels, of which it could only warn."""
@@ -112,7 +112,7 @@ def test_a_saved_one_is_loaded_inspected_and_made_sparser(algorithm, compute, tm
     loaded = type(plain).load(tmp_path / "model.zip")
     for name, value in plain.policy.state_dict().items():
         assert th.equal(loaded.policy.state_dict()[name], value), name
-    assert algo_of(tmp_path / "model.zip") == algorithm.lower()
+    assert algos_of(tmp_path / "model.zip")[0] == algorithm.lower()
     report = inspect_model(tmp_path / "model.zip").report
     assert report == plain.policy.sparsity_report()
     twins = sparsify(plain, 0.9), sparsify(wrapped, 0.9)

@@ -31,10 +31,10 @@ from sb3_sparse.policies.spec import NetworkSpec
 from sb3_sparse.policies.storage import may_be_sparse
 from sb3_sparse.policies.vectors import from_vector, to_vector
 
-Sparse = TypeVar("Sparse", bound="SparsePolicyMixin")
+Sparse = TypeVar("Sparse", bound="BaseSparsePolicy")
 
 
-class SparsePolicyMixin(Acts):
+class BaseSparsePolicy(Acts):
     """Sparse networks inside an SB3 policy. SB3's own arguments keep their meaning.
 
     :param observation_space: as in SB3
@@ -65,6 +65,19 @@ class SparsePolicyMixin(Acts):
 
     networks: ClassVar[Mapping[str, NetworkSpec]]
     """Name of each network and where its modules are."""
+    acting: ClassVar[tuple[str, ...]]
+    """Modules that an observation passes through to become an action: a features extractor, then
+    those of the network."""
+    acting_quantiles: ClassVar[str] = ""
+    """Attribute with the number of quantiles that the network has for each action; it acts by their
+    mean."""
+    action_spaces: ClassVar[tuple[type[spaces.Space[Any]], ...]] = (
+        spaces.Box,
+        spaces.Discrete,
+        spaces.MultiDiscrete,
+        spaces.MultiBinary,
+    )
+    """Action spaces that the policy can act in."""
     functional_gradients: ClassVar[bool] = False
     """Whether an algorithm of this policy takes gradients with ``torch.autograd.grad``."""
     extractor_class: ClassVar[type[BaseFeaturesExtractor] | None] = None

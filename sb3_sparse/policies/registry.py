@@ -1,0 +1,220 @@
+"""The algorithms that have a sparse policy, by name.
+
+Names are known without torch. Whoever asks for a class imports the module that registers it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Container, Mapping
+from dataclasses import dataclass
+from importlib import import_module
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from sb3_sparse.errors import ConfigError
+
+if TYPE_CHECKING:  # imported when an algorithm is, not when one is named
+    from stable_baselines3.common.base_class import BaseAlgorithm
+    from stable_baselines3.common.policies import BasePolicy
+    from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+
+    from sb3_sparse.policies.base import BaseSparsePolicy
+    from sb3_sparse.policies.spec import PassCounts
+
+    CountPasses = Callable[[Any], list[PassCounts]]
+
+SparsePolicy = "SparsePolicy"
+"""The sparse policy of whichever algorithm it is passed to."""
+SB3 = {
+    "DQN": "dqn",
+    "SAC": "sac",
+    "TD3": "td3",
+    "DDPG": "td3",
+    "PPO": "actor_critic",
+    "A2C": "actor_critic",
+}
+"""Algorithms of Stable-Baselines3, and the module of this package that registers each."""
+CONTRIB = ("TQC", "QRDQN", "CrossQ", "TRPO")
+"""Algorithms of sb3-contrib; the module ``contrib`` registers them."""
+Policy = TypeVar("Policy", bound="BaseSparsePolicy")
+
+
+@dataclass(frozen=True)
+class Registration:
+    """An algorithm and its sparse policy, as :func:`register_policy` was told.
+
+    :param algorithm: the algorithm's class
+    :param policy: the class of its sparse policy
+    :param passes: counts the passes of a gradient step; None: not known
+    :param told_by: attribute that tells its models from others' with the same policy
+    """
+
+    algorithm: type[BaseAlgorithm]
+    policy: type[BaseSparsePolicy]
+    passes: CountPasses | None
+    told_by: str
+
+    @property
+    def stock_policy(self) -> type[BasePolicy]:
+        """The policy class that :attr:`policy` makes sparse."""
+        from stable_baselines3.common.policies import BasePolicy
+
+        from sb3_sparse.policies.modes import SwitchesModes
+
+        return next(
+            cls
+            for cls in self.policy.__mro__
+            if issubclass(cls, BasePolicy) and not issubclass(cls, SwitchesModes)
+        )
+
+
+_registered: dict[str, Registration] = {}
+_variants: dict[type[BaseSparsePolicy], dict[str, type[BaseSparsePolicy]]] = {}
+_rejected: list[type[BaseAlgorithm]] = []
+
+
+def register_policy(
+    algorithm: type[BaseAlgorithm], *, passes: CountPasses | None = None, told_by: str = ""
+) -> Callable[[type[Policy]], type[Policy]]:
+    """Class decorator that makes a class the sparse policy of an algorithm.
+
+    The algorithm then takes ``"SparsePolicy"``, and all commands know it by its lower-case name. ::
+
+        @register_policy(MySAC)
+        class MySACPolicy(SparseSACPolicy): ...
+
+    :param algorithm: class of the algorithm
+    :param passes: counts the passes of one gradient step of a model, for
+        :func:`sb3_sparse.analysis.flops`. Not needed where ``train()`` is that of a registered
+        algorithm
+    :param told_by: attribute of its models that those of other algorithms with the same policy
+        class lack. It tells what a zip was saved by
+    :raises ConfigError: if another algorithm has that name already
+    """
+
+    def register(policy: type[Policy]) -> type[Policy]:
+        name = algorithm.__name__
+        for known, one in _registered.items():
+            if known.lower() == name.lower() and _address(one.algorithm) != _address(algorithm):
+                raise ConfigError(
+                    f"the algorithm name {known!r} is taken by {_address(one.algorithm)}; give "
+                    f"{_address(algorithm)} another"
+                )
+        _registered[name] = Registration(algorithm, policy, passes, told_by)
+        if "policy_aliases" not in vars(algorithm):  # but shares those of its base class
+            stock = {
+                n: c for n, c in algorithm.policy_aliases.items() if not n.startswith("Sparse")
+            }
+            algorithm.policy_aliases = stock
+        _add_aliases(algorithm, {"": policy, **_variants.get(policy, {})})
+        return policy
+
+    return register
+
+
+def with_extractor(
+    policy: type[Policy], prefix: str, extractor: type[BaseFeaturesExtractor]
+) -> type[Policy]:
+    """A subclass of a sparse policy with another default features extractor.
+
+    The algorithms that the policy is registered for know it as ``"Sparse<prefix>Policy"``.
+
+    :param policy: a registered policy class
+    :param prefix: put between the class name and ``Policy``, e.g. ``"Cnn"``; the module must bind
+        the class to that name, or it cannot be pickled
+    :param extractor: class of the features extractor
+    """
+    name = policy.__name__.removesuffix("Policy") + prefix + "Policy"
+    members = {
+        "__module__": policy.__module__,
+        "__doc__": f"{policy.__name__} with {extractor.__name__} by default.",
+        "extractor_class": extractor,
+    }
+    variant = type(name, (policy,), members)
+    _variants.setdefault(policy, {})[prefix] = variant
+    for one in _registered.values():
+        if one.policy is policy:
+            _add_aliases(one.algorithm, {prefix: variant})
+    return variant
+
+
+def _add_aliases(algorithm: type[BaseAlgorithm], policies: Mapping[str, type[BasePolicy]]) -> None:
+    for prefix, policy in policies.items():
+        algorithm.policy_aliases[f"Sparse{prefix}Policy"] = policy
+
+
+def reject(algorithm: type[BaseAlgorithm], policy: type[BasePolicy]) -> None:
+    """Let an algorithm that has no sparse policy say so.
+
+    :param policy: raises an error when made
+    """
+    _add_aliases(algorithm, dict.fromkeys(("", "Mlp", "Cnn", "MultiInput"), policy))
+    _rejected.append(algorithm)
+
+
+def _address(cls: type) -> str:
+    """Where a class is defined; the same when its cell or module is run again."""
+    return f"{cls.__module__}.{cls.__qualname__}"
+
+
+def algorithm_names() -> list[str]:
+    """Class names of all algorithms with a sparse policy that are installed or registered."""
+    shipped = [*SB3, *(CONTRIB if find_spec("sb3_contrib") else ())]
+    return list(dict.fromkeys([*shipped, *_registered]))
+
+
+def registered() -> dict[str, Registration]:
+    """Every registration by the algorithm's class name, those of users last."""
+    for module in (*SB3.values(), *(("contrib",) if find_spec("sb3_contrib") else ())):
+        import_module(f"sb3_sparse.policies.{module}")
+    return {name: _registered[name] for name in algorithm_names()}
+
+
+def supported_algorithms() -> dict[str, type[BaseAlgorithm]]:
+    """The algorithms that a sparse policy is registered for, by class name."""
+    return {name: one.algorithm for name, one in registered().items()}
+
+
+def lineage(algo: str) -> list[str]:
+    """Lower-case names of an algorithm and of the classes that it inherits from.
+
+    :param algo: lower-case name
+    """
+    for name, one in registered().items():
+        if name.lower() == algo:
+            return [cls.__name__.lower() for cls in one.algorithm.__mro__]
+    return [algo]
+
+
+def sparse_counterpart(policy: BasePolicy) -> type[BaseSparsePolicy] | None:
+    """The class that declares where a policy keeps its networks; None: there is none.
+
+    :param policy: sparse, which is its own counterpart, or stock
+    """
+    from sb3_sparse.policies.base import BaseSparsePolicy
+
+    if isinstance(policy, BaseSparsePolicy):
+        return type(policy)
+    known = registered().values()
+    for cls in type(policy).__mro__:
+        for one in known:
+            if cls is one.stock_policy:
+                return one.policy
+    return None
+
+
+def writers_of(policy: type, attributes: Container[str]) -> list[str]:
+    """Class names of the algorithms that may have saved a model, the likeliest first.
+
+    :param policy: class of the model's policy
+    :param attributes: names of the model's attributes
+    """
+    known = registered()
+    for cls in policy.__mro__:
+        if any(cls in algorithm.policy_aliases.values() for algorithm in _rejected):
+            break
+        same = [n for n, one in known.items() if cls in one.algorithm.policy_aliases.values()]
+        if same:
+            told = [name for name in same if known[name].told_by in attributes]
+            return told or [name for name in same if not known[name].told_by]
+    return []
