@@ -31,7 +31,7 @@ from random_env import RandomEnv
 from stable_baselines3 import SAC
 
 from sb3_sparse import SparsePolicy
-from sb3_sparse.export import export
+from sb3_sparse.export import export_policy
 from sb3_sparse.export.artifact import compiler
 from sb3_sparse.sparsity.widths import equivalent_widths, mlp_parameters
 
@@ -157,16 +157,16 @@ def variants(sizes: list[int], sparsity: float, folder: Path) -> Variants:
     sparse, dense = actor(sizes, sparsity), actor(sizes, 0.0)
     rows = np.random.default_rng(0).normal(size=(OBSERVATIONS, sizes[0])).astype(np.float32)
     each = list(rows)
-    report = export(sparse, folder / "sparse", "c")
-    export(sparse, folder / "sparse", "numpy")
-    export(sparse, folder / "int8", "c", int8=True)
-    export(dense, folder / "dense", "onnx")
+    report = export_policy(sparse, folder / "sparse", "c")
+    export_policy(sparse, folder / "sparse", "numpy")
+    export_policy(sparse, folder / "int8", "c", int8=True)
+    export_policy(dense, folder / "dense", "onnx")
     widths, _ = equivalent_widths(
         sizes[1:-1],
         lambda hidden: mlp_parameters(sizes[0], hidden, sizes[-1]),
         report.nnz + sum(sizes[1:]),
     )
-    export(actor([sizes[0], *widths, sizes[-1]], 0.0), folder / "narrow", "c")
+    export_policy(actor([sizes[0], *widths, sizes[-1]], 0.0), folder / "narrow", "c")
     weights = report.dense_bytes
     empty, nothing = empty_session(folder), {"obs": np.zeros((1, 1), np.float32)}
     session = session_of(folder / "dense.onnx")

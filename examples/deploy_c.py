@@ -16,7 +16,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_sparse import PPO, SparsityCallback
-from sb3_sparse.export import export, record_observations
+from sb3_sparse.export import export_policy, record_observations
 
 
 def load(source, actions):
@@ -66,7 +66,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         # The environment's own normalisation goes into the file.
         seen = record_observations(model, env, 1000)
-        report = export(model, Path(folder) / "policy", "c", observations=seen)
+        report = export_policy(model, Path(folder) / "policy", "c", observations=seen)
         print(report)
         act_in_c = load(Path(folder) / "policy.c", env.action_space.shape[0])
 

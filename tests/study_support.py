@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import yaml
 
-from sb3_sparse.launch.base import Ended, Launcher, Task
+from sb3_sparse.launch.base import Launcher, Task, TaskResult
 from sb3_sparse.studies import Study, run_study
 
 QUICK = {
@@ -30,9 +30,9 @@ class Here(Launcher):
             self.called.append(task.name)
             if self.fails.get(task.name, 0) > 0:
                 self.fails[task.name] -= 1
-                yield Ended(task, error="Traceback: it broke")
+                yield TaskResult(task, error="Traceback: it broke")
             else:
-                yield Ended(task, value=task())
+                yield TaskResult(task, value=task())
 
 
 def study(tmp_path, name="mine", **changed):

@@ -36,7 +36,7 @@ FORBIDDEN = {
 EDGES = {
     "sb3_contrib": {"policies"},
     "typer": {"cli"},
-    "rich": {"cli", "zoo"},
+    "rich": {"cli"},
     "rl_zoo3": {"zoo", "rl_zoo_optimize"},
     "optuna": {"tuning"},
     "matplotlib": {"report"},

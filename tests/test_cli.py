@@ -123,7 +123,7 @@ def test_a_run_that_is_asked_to_stop_says_how_to_go_on(tmp_path):
     said, _ = running.communicate(timeout=60)
     assert running.returncode == 130
     steps = DQN.load(folder / "CartPole-v1.zip").num_timesteps
-    assert f"Stopped after {steps} steps. Go on with:" in said
+    assert f"Stopped after {steps} steps. Resume with:" in said
     assert "sb3-sparse train --resume logs/dqn/CartPole-v1_1" in said
 
 
@@ -141,7 +141,7 @@ def test_an_interrupt_says_how_to_go_on_with_this_run(folder, monkeypatch, capsy
     assert ended.value.code == 130
     last = capsys.readouterr().out.splitlines()[-1]
     if folder is None:
-        assert last == "Interrupted before the run had begun; nothing is left of it."
+        assert last == "Interrupted before the run began; no files were left behind."
     else:
         assert last == "sb3-sparse train --resume 'my logs/dqn/CartPole-v1_3'"
 
@@ -197,7 +197,7 @@ def test_options_and_a_second_run_beside_the_first(tmp_path):
         ),
         (["--hyperparams", "optimizer_kwargs:{'epz':1}"], "do not work: TypeError"),
         (["--resume", "nowhere"], "no run of sb3-sparse in nowhere"),
-        (["--resume", "nowhere", "--seed", "3"], "--resume takes everything from the run; drop"),
+        (["--resume", "nowhere", "--seed", "3"], "--resume takes all settings from the run; drop"),
         (["--conf-file", "mine.yml"], "there is no config file mine.yml"),
     ],
 )

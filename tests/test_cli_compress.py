@@ -126,7 +126,7 @@ def test_an_interrupted_compression_goes_on(run):
     running.send_signal(signal.SIGINT)
     said, _ = running.communicate(timeout=60)
     assert running.returncode == 130, said
-    assert "Interrupted. What was done is kept; the same command goes on." in said
+    assert "Interrupted. Finished levels are kept; give the same command to resume." in said
     said = sb3_sparse(*args)
     assert "Going on after level" in said
     assert "Level 1:" not in said

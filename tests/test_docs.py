@@ -16,7 +16,7 @@ from stable_baselines3 import DQN, SAC
 from support import arguments_of, assert_masked, make
 
 from sb3_sparse import SparsePolicy, cli
-from sb3_sparse.export import export
+from sb3_sparse.export import export_policy
 from sb3_sparse.topology import registry
 from sb3_sparse.tuning import space_of
 from sb3_sparse.tuning.search import define
@@ -267,8 +267,8 @@ def test_the_programs_of_the_deployment_document_run(tmp_path):
     (command,) = [line for line in text.splitlines() if line.startswith("cc ")]
     (loader,) = python_blocks("docs/deploy.md")
     model = make("SAC")
-    export(model, tmp_path / "policy", "c")
-    export(model, tmp_path / "policy", "numpy")
+    export_policy(model, tmp_path / "policy", "c")
+    export_policy(model, tmp_path / "policy", "numpy")
     (tmp_path / "main.c").write_text(main)
     said = subprocess.run(command, shell=True, cwd=tmp_path, capture_output=True, check=True).stdout
     action, _ = model.predict(np.zeros(3, np.float32), deterministic=True)

@@ -1,4 +1,4 @@
-"""The command line, ``sb3-sparse``: one file a command or two."""
+"""The command line, ``sb3-sparse``: each file defines one or two commands."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ try:
     import typer
     from rich.console import Console
 
-    from sb3_sparse.cli.compress import compress
-    from sb3_sparse.cli.export import export
-    from sb3_sparse.cli.look import enjoy, inspect
+    from sb3_sparse.cli.compress import compress_command
+    from sb3_sparse.cli.export import export_command
+    from sb3_sparse.cli.look import enjoy_command, inspect_command
     from sb3_sparse.cli.study import studies
-    from sb3_sparse.cli.train import train
+    from sb3_sparse.cli.train import train_command
     from sb3_sparse.cli.tune import tuning
 except ImportError as error:
     sys.exit(str(error if isinstance(error, MissingExtra) else MissingExtra("this command", "zoo")))
@@ -29,19 +29,19 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Sparse training inside Stable-Baselines3.",
 )
-app.command(context_settings=MORE_VALUES)(train)
-app.command()(enjoy)
-app.command()(inspect)
-app.command()(compress)
-app.command()(export)
+app.command("train", context_settings=MORE_VALUES)(train_command)
+app.command("enjoy")(enjoy_command)
+app.command("inspect")(inspect_command)
+app.command("compress")(compress_command)
+app.command("export")(export_command)
 app.add_typer(tuning, name="tune", help="Search hyperparameters with Optuna, and report.")
 app.add_typer(studies, name="study", help="Run and report whole comparisons, as the paper's.")
 
 
 def _show_ours_alone() -> None:
-    """Show our own warnings without the line of code that they come from, which says nothing here.
+    """Show warnings of this package without the line of code that raised them.
 
-    The change ends with ``warnings.catch_warnings``.
+    ``warnings.catch_warnings`` undoes it.
     """
     show = warnings.showwarning
 
@@ -56,7 +56,7 @@ def _show_ours_alone() -> None:
 
 
 def main() -> None:
-    """Run the command line; a user's mistake is one line on stderr and exit code 2."""
+    """Run the command line; report a user's mistake as one line on stderr, with exit code 2."""
     try:
         with warnings.catch_warnings():
             _show_ours_alone()

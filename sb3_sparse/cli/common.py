@@ -1,4 +1,4 @@
-"""What the commands share: the console, and the options that say what is trained."""
+"""Shared by the commands: the console, and the options that several of them have."""
 
 from __future__ import annotations
 
@@ -12,34 +12,47 @@ from rich.text import Text
 from sb3_sparse.errors import ConfigError
 
 console = Console(highlight=False, markup=False)
-"""Prints text as it is: names of folders may hold what Rich would take for markup."""
+"""Prints text unchanged: names of folders may contain what Rich takes for markup."""
 INTERRUPTED = 130
 AS_CONFIG = "as the config"
 
 
-def text(help: str, *names: str, shown: str | bool = True) -> Any:
-    """An option."""
+def option(help: str, *names: str, shown: str | bool = True) -> Any:
+    """Describe an option of a command.
+
+    :param help: shown by ``--help``
+    :param names: e.g. ``"--log-folder", "-f"``; by default the parameter's name
+    :param shown: the default as ``--help`` shows it; True: its value, False: nothing
+    """
     return typer.Option(*names, help=help, show_default=shown)
 
 
-Algo = Annotated[str, text("Algorithm: dqn, sac, ppo, td3, tqc, ...")]
-Env = Annotated[str, text("Gymnasium environment id, or package:Id.")]
+def say(text: object, style: str | None = None) -> None:
+    """Print a line, however long, without wrapping it.
+
+    :param style: one of Rich's, e.g. ``"bold"``
+    """
+    console.print(str(text), soft_wrap=True, style=style)
+
+
+Algo = Annotated[str, option("Algorithm: dqn, sac, ppo, td3, tqc, ...")]
+Env = Annotated[str, option("Gymnasium environment id, or package:Id.")]
 GymPackages = Annotated[
     list[str] | None,
-    text(
+    option(
         "Module that registers environments of your own; may be given again.",
         "--gym-packages",
         shown=False,
     ),
 ]
-Method = Annotated[str | None, text("dense, prune, static, set or rigl.", shown="rigl")]
-Sparsity = Annotated[float | None, text("Removed fraction, in [0, 1).", shown=AS_CONFIG)]
-Distribution = Annotated[str | None, text("erk, er or uniform.", shown="erk")]
-Steps = Annotated[int | None, text("Environment steps.", "--n-timesteps", "-n", shown=AS_CONFIG)]
-Envs = Annotated[int | None, text("Environments side by side.", shown=AS_CONFIG)]
+Method = Annotated[str | None, option("dense, prune, static, set or rigl.", shown="rigl")]
+Sparsity = Annotated[float | None, option("Removed fraction, in [0, 1).", shown=AS_CONFIG)]
+Distribution = Annotated[str | None, option("erk, er or uniform.", shown="erk")]
+Steps = Annotated[int | None, option("Environment steps.", "--n-timesteps", "-n", shown=AS_CONFIG)]
+Envs = Annotated[int | None, option("Environments side by side.", shown=AS_CONFIG)]
 Hyperparams = Annotated[
     list[str] | None,
-    text(
+    option(
         "Anything else, as name:value ..., e.g. learning_rate:0.001 weight_decay:1e-4 "
         "update_interval:500.",
         "--hyperparams",
@@ -48,31 +61,33 @@ Hyperparams = Annotated[
 ]
 ConfFile = Annotated[
     str | None,
-    text(
+    option(
         "A YAML file in rl-zoo's form, or another shipped one by name (dqn_impala).",
         "--conf-file",
         "-conf",
     ),
 ]
-EvalFreq = Annotated[int | None, text("Steps between two evaluations.", shown="as the paper")]
-EvalEpisodes = Annotated[int | None, text("Episodes of an evaluation.", shown="as the paper")]
-Best = Annotated[bool, text("Of a run's folder, the best policy instead of the last.", "--best")]
-ModelAlgo = Annotated[str | None, text("Algorithm.", shown="as the run or the file")]
+EvalFreq = Annotated[int | None, option("Steps between two evaluations.", shown="as the paper")]
+EvalEpisodes = Annotated[int | None, option("Episodes of an evaluation.", shown="as the paper")]
+Best = Annotated[bool, option("Of a run's folder, the best policy instead of the last.", "--best")]
+ModelAlgo = Annotated[str | None, option("Algorithm.", shown="as the run or the file")]
 ModelEnv = Annotated[
-    str | None, text("Gymnasium environment id, or package:Id.", shown="as the run")
+    str | None, option("Gymnasium environment id, or package:Id.", shown="as the run")
 ]
 Statistics = Annotated[
     Path | None,
-    text("Statistics saved by VecNormalize.", "--vecnormalize", shown="those of the run"),
+    option("Statistics saved by VecNormalize.", "--vecnormalize", shown="those of the run"),
 ]
-Launcher = Annotated[str, text("local: processes of this machine; ray: a Ray cluster.")]
-Address = Annotated[str | None, text("Of the Ray cluster, e.g. auto.", shown="one of this machine")]
-Device = Annotated[str, text("auto, cpu or cuda.")]
-LogFolder = Annotated[Path, text("Where folders are made.", "--log-folder", "-f")]
+Launcher = Annotated[str, option("local: processes of this machine; ray: a Ray cluster.")]
+Address = Annotated[
+    str | None, option("Of the Ray cluster, e.g. auto.", shown="one of this machine")
+]
+Device = Annotated[str, option("auto, cpu or cuda.")]
+LogFolder = Annotated[Path, option("Where folders are made.", "--log-folder", "-f")]
 
 
 def print_score(what: str, mean: float, std: float, path: Path) -> None:
-    """A line on a policy's return."""
+    """Print a policy's return, and where the policy is."""
     score = (f"{mean:.1f} ± {std:.1f}", "bold")
     console.print(Text.assemble(f"{what:<13} ", score, f"  {path}"), soft_wrap=True)
 
@@ -80,10 +95,10 @@ def print_score(what: str, mean: float, std: float, path: Path) -> None:
 def values_and_packages(
     extra: list[str], hyperparams: list[str] | None, gym_packages: list[str] | None
 ) -> tuple[list[str], list[str]]:
-    """What follows ``--hyperparams`` and ``--gym-packages``, which both take several words.
+    """Split the words after ``--hyperparams`` and ``--gym-packages``, which take several each.
 
-    :param extra: words that no option has taken
-    :raises ConfigError: if one belongs to neither
+    :param extra: the words left over by all other options
+    :raises ConfigError: if a word belongs to neither option
     """
     values, packages = list(hyperparams or []), list(gym_packages or [])
     for word in extra:

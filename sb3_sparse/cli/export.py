@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from sb3_sparse.cli.common import Best, GymPackages, ModelAlgo, ModelEnv, Statistics, console, text
+from sb3_sparse.cli.common import Best, GymPackages, ModelAlgo, ModelEnv, Statistics, option, say
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.export.formats import check_format
 
@@ -15,29 +15,30 @@ RECORDED = 1000
 RECORDING_ENVS = 10
 
 
-def export(
+def export_command(
     model: Annotated[Path, typer.Argument(help="A run's folder, or a zip saved by SB3.")],
     out: Annotated[
         Path, typer.Argument(help="The file to write; its suffix may be left out.")
     ] = Path("policy"),
-    to: Annotated[str, text("c, numpy, onnx or dense (a zip of stock SB3).", "--to")] = "c",
+    to: Annotated[str, option("c, numpy, onnx or dense (a zip of stock SB3).", "--to")] = "c",
     vecnormalize: Statistics = None,
     int8: Annotated[
-        bool, text("C only: weights as 8-bit numbers with a scale for each row.", "--int8")
+        bool, option("C only: weights as 8-bit numbers with a scale for each row.", "--int8")
     ] = False,
     best: Best = False,
     env: ModelEnv = None,
     gym_packages: GymPackages = None,
     algo: ModelAlgo = None,
-    force: Annotated[bool, text("Write also what does not act as the model.", "--force")] = False,
+    force: Annotated[
+        bool, option("Write the policy even if it does not act as the model.", "--force")
+    ] = False,
 ) -> None:
-    """Write a policy as C, NumPy or ONNX, or as a dense zip, and check that it acts the same.
+    """Write a policy as C, NumPy, ONNX or a dense zip, and check that it acts the same.
 
-    Observations to check with are recorded in the environment, if it is known.
+    The check uses random observations, and recorded ones if the environment is known.
     """
     check_format(to)
-    from sb3_sparse.export import export as write
-    from sb3_sparse.export import record_observations
+    from sb3_sparse.export import export_policy, record_observations
     from sb3_sparse.zoo.finetune import evaluation_envs
     from sb3_sparse.zoo.saved import find_saved
 
@@ -59,7 +60,7 @@ def export(
             observations = record_observations(loaded, envs, RECORDED)
         finally:
             envs.close()
-    report = write(
+    report = export_policy(
         loaded,
         out,
         to,
@@ -68,14 +69,11 @@ def export(
         int8=int8,
         force=force,
     )
-    console.print(str(report), soft_wrap=True)
+    say(report)
     if observations is None:
-        console.print(
-            "note: no observations were recorded; --env ID compares them on an environment's, too",
-            soft_wrap=True,
-        )
+        say("note: no observations were recorded; --env ID compares the policies on an environment")
 
 
 def _as_zip(out: Path) -> Path:
-    """Where a dense zip goes."""
+    """Say where a dense zip is written."""
     return out / "policy.zip" if out.is_dir() else out.with_suffix(".zip")

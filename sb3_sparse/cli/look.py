@@ -14,30 +14,31 @@ from sb3_sparse.cli.common import (
     ModelEnv,
     Statistics,
     console,
+    option,
     print_score,
-    text,
+    say,
 )
 
 
-def enjoy(
+def enjoy_command(
     model: Annotated[Path, typer.Argument(help="A run's folder, or a zip saved by SB3.")],
-    episodes: Annotated[int, text("How many episodes.", "--episodes", "-n")] = 20,
+    episodes: Annotated[int, option("How many episodes.", "--episodes", "-n")] = 20,
     best: Best = False,
-    video: Annotated[bool, text("Record a video of the first 1000 steps.", "--video")] = False,
-    seed: Annotated[int, text("Seed of the environment.")] = 0,
+    video: Annotated[bool, option("Record a video of the first 1000 steps.", "--video")] = False,
+    seed: Annotated[int, option("Seed of the environment.")] = 0,
     env: ModelEnv = None,
     algo: ModelAlgo = None,
     vecnormalize: Statistics = None,
     gym_packages: GymPackages = None,
 ) -> None:
     """Evaluate a saved policy, and record a video of it."""
-    from sb3_sparse.zoo.progress import EpisodesProgress
-    from sb3_sparse.zoo.scoring import enjoy as score_run
+    from sb3_sparse.cli.progress.train import EpisodesProgress
+    from sb3_sparse.zoo.scoring import enjoy
 
     progress = EpisodesProgress(console)
     what = "Filming" if video else "Playing"
     try:
-        score = score_run(
+        score = enjoy(
             model,
             episodes,
             best,
@@ -51,19 +52,19 @@ def enjoy(
         )
     finally:
         progress.close()
-    console.print(f"Return over {score.episodes} episodes:")
+    say(f"Return over {score.episodes} episodes:")
     whose = "Best policy:" if score.model.name == "best_model.zip" else "Last policy:"
     if not model.is_dir():
         whose = "Policy:"
     print_score(whose, score.mean_return, score.std_return, score.model)
     for path in score.videos:
-        console.print(f"Video: {path}", soft_wrap=True)
+        say(f"Video: {path}")
 
 
-def inspect(
+def inspect_command(
     model: Annotated[Path, typer.Argument(help="A run's folder, or a model saved by SB3 (.zip).")],
 ) -> None:
     """Print the layers of a saved sparse model, and how each of them computes."""
     from sb3_sparse.zoo.inspection import inspect_model
 
-    console.print(str(inspect_model(model)), soft_wrap=True)
+    say(inspect_model(model))

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.table import Table
 
-from sb3_sparse.cli.common import INTERRUPTED, Address, GymPackages, Launcher, console, text
-from sb3_sparse.cli.studyprogress import StudyProgress
+from sb3_sparse.cli.common import INTERRUPTED, Address, GymPackages, Launcher, console, option, say
+from sb3_sparse.cli.progress.study import StudyProgress
 from sb3_sparse.errors import ConfigError, MissingExtra, command
 from sb3_sparse.launch import launcher_named
 from sb3_sparse.studies import Study
@@ -25,20 +25,20 @@ studies = typer.Typer(no_args_is_help=True)
 Name = Annotated[str, typer.Argument(help="A name of `study list`, or a file of your own, .yml.")]
 Scale = Annotated[
     str,
-    text(
+    option(
         "smoke (minutes), small (a night on a laptop), medium (days, of some studies) or paper "
         "(its seeds and steps)."
     ),
 ]
 Archive = Annotated[
     Path | None,
-    text(
+    option(
         "JSON-lines file of cells that are over, to be committed; they count as done.",
         "--archive",
         shown=False,
     ),
 ]
-Store = Annotated[Path, text("Where runs and reports go; studies share it.", "--folder", "-f")]
+Store = Annotated[Path, option("Where runs and reports go; studies share it.", "--folder", "-f")]
 
 
 @studies.command("list")
@@ -51,14 +51,14 @@ def list_() -> None:
         runs = planned_runs(name)
         table.add_row(name, title_of(name), *(str(runs.get(scale, "")) for scale in SCALES))
     console.print(table)
-    console.print("Numbers are runs. Go on with: sb3-sparse study run NAME --scale SCALE")
+    say("Numbers are runs. Go on with: sb3-sparse study run NAME --scale SCALE")
 
 
 @studies.command()
 def run(
     name: Name,
     scale: Scale = "small",
-    workers: Annotated[int, text("Runs at once, each a process of one thread.")] = 1,
+    workers: Annotated[int, option("Runs at once, each a process of one thread.")] = 1,
     launcher: Launcher = "local",
     address: Address = None,
     store: Store = Path("studies"),
@@ -81,28 +81,28 @@ def run(
         for last in runner:
             shown(last)
     except KeyboardInterrupt:
-        console.print("Stopping; what is running is kept up to its last checkpoint ...")
+        say("Stopping; what is running is kept up to its last checkpoint ...")
         runner.close()
         more = ["--workers", str(workers)] if workers > 1 else []
-        console.print(f"Go on with: {asked.command('run', *more)}", soft_wrap=True)
+        say(f"Go on with: {asked.command('run', *more)}")
         raise typer.Exit(INTERRUPTED) from None
     finally:
         shown.close()
     assert last is not None
     if last.elsewhere:
-        console.print(f"{last.elsewhere} runs are trained by other processes; look again with:")
-        console.print(asked.command("status"), soft_wrap=True)
+        say(f"{last.elsewhere} runs are trained by other processes; look again with:")
+        say(asked.command("status"))
     alike: dict[str, list[str]] = {}
     for failed, error in last.failed.items():
         alike.setdefault(error.rstrip(), []).append(failed)
     for error, runs in alike.items():
-        console.print(f"\nFailed twice: {'; '.join(runs)}", style="bold")
-        console.print(error, soft_wrap=True)
-    console.print(f"{last.done} of {last.planned} runs are done.")
+        say(f"\nFailed twice: {'; '.join(runs)}", style="bold")
+        say(error)
+    say(f"{last.done} of {last.planned} runs are done.")
     if last.diverged:
-        console.print(f"Diverged, and not run again: {last.diverged}; the report names them.")
+        say(f"Diverged, and not run again: {last.diverged}; the report names them.")
     if last.done or last.diverged:
-        console.print(f"Draw them: {asked.command('report')}", soft_wrap=True)
+        say(f"Draw them: {asked.command('report')}")
     if last.failed:
         raise typer.Exit(1)
 
@@ -124,19 +124,19 @@ def status(
     statuses = asked.statuses(study)
     _say_merged(study)
     found = counts(statuses)
-    console.print(f"{study.title}, scale {scale}: {len(statuses)} runs")
-    console.print(", ".join(f"{number} {what}" for what, number in found.items()))
+    say(f"{study.title}, scale {scale}: {len(statuses)} runs")
+    say(", ".join(f"{number} {what}" for what, number in found.items()))
     done = Counter(one.cell.run.env_id for one in statuses if one.status == "done")
     for env_id, planned in Counter(one.cell.run.env_id for one in statuses).items():
-        console.print(f"  {env_id}: {done[env_id]} of {planned}")
+        say(f"  {env_id}: {done[env_id]} of {planned}")
     for one in statuses:
         if one.status in (RUNNING, STOPPED):
-            console.print(f"{one.status}: {one.cell.name}, {one.steps} steps")
+            say(f"{one.status}: {one.cell.name}, {one.steps} steps")
         if one.status == DIVERGED:
-            console.print(f"diverged: {one.cell.name}, at step {one.steps}", soft_wrap=True)
+            say(f"diverged: {one.cell.name}, at step {one.steps}")
         if one.status == FAILED:
             why = one.reason or f"see {one.cell.errors(store)}"
-            console.print(f"failed: {one.cell.name}; {why}", soft_wrap=True)
+            say(f"failed: {one.cell.name}; {why}")
 
 
 @studies.command()
@@ -146,7 +146,7 @@ def report(
     store: Store = Path("studies"),
     archive: Archive = None,
     out: Annotated[
-        Path | None, text("Where it is written.", "--out", "-o", shown="<folder>/<name>/<scale>")
+        Path | None, option("Where it is written.", "--out", "-o", shown="<folder>/<name>/<scale>")
     ] = None,
     gym_packages: GymPackages = None,
 ) -> None:
@@ -173,14 +173,13 @@ def report(
         archived=archived,
         pending=[_pending(one, store) for one in statuses if one.status not in OVER],
     )
-    console.print(f"Written: {page}", soft_wrap=True)
+    say(f"Written: {page}")
 
 
 def _say_merged(study: Study) -> None:
     if study.merged:
         names = "; ".join(study.merged)
-        line = f"note: in the file more than once, and trained once: {names}"
-        console.print(line, markup=False, soft_wrap=True)
+        say(f"note: in the file more than once, and trained once: {names}")
 
 
 def _check_figures(study: Study) -> None:

@@ -28,10 +28,10 @@ from sb3_sparse.cli.common import (
     Sparsity,
     Steps,
     console,
-    text,
+    option,
     values_and_packages,
 )
-from sb3_sparse.cli.tuneprogress import TuningProgress, values_in_words
+from sb3_sparse.cli.progress.tune import TuningProgress, values_in_words
 from sb3_sparse.launch import launcher_named
 from sb3_sparse.tuning.choices import check_names
 from sb3_sparse.zoo.settings import parse_overrides
@@ -55,7 +55,7 @@ class _SearchByDefault(TyperGroup):
 tuning = typer.Typer(cls=_SearchByDefault)
 Storage = Annotated[
     str | None,
-    text(
+    option(
         "A journal file, or a database: postgresql://user:password@host/database, sqlite:///file.db.",
         shown="tune/journal.log in the log folder",
     ),
@@ -71,32 +71,32 @@ def search(
     sparsity: Sparsity = None,
     distribution: Distribution = None,
     space: Annotated[
-        str, text("paper (its grid), wide (continuous), or a file of your own, .yml or .py.")
+        str, option("paper (its grid), wide (continuous), or a file of your own, .yml or .py.")
     ] = "paper",
     trials: Annotated[
         int | None,
-        text("How many trials.", "--trials", "--n-trials", shown="a whole grid, else 100"),
+        option("How many trials.", "--trials", "--n-trials", shown="a whole grid, else 100"),
     ] = None,
-    seeds: Annotated[int, text("Runs a trial; the mean counts.")] = 1,
+    seeds: Annotated[int, option("Runs a trial; the mean counts.")] = 1,
     sampler: Annotated[
-        str | None, text("grid, tpe or random.", shown="grid where all is lists, else tpe")
+        str | None, option("grid, tpe or random.", shown="grid where all is lists, else tpe")
     ] = None,
     pruner: Annotated[
         str | None,
-        text("none, median, halving or hyperband.", shown="none for a grid, else median"),
+        option("none, median, halving or hyperband.", shown="none for a grid, else median"),
     ] = None,
-    workers: Annotated[int, text("Trials at once, each a process of one thread.")] = 1,
+    workers: Annotated[int, option("Trials at once, each a process of one thread.")] = 1,
     launcher: Launcher = "local",
     address: Address = None,
     storage: Storage = None,
     study_name: Annotated[
-        str | None, text("Name of the study.", shown="made of algorithm, env, method, space")
+        str | None, option("Name of the study.", shown="made of algorithm, env, method, space")
     ] = None,
     write_into: Annotated[
         Path | None,
-        text("A config, e.g. zoo_hparams/rigl/sac.yml, whose entry gets the best values too."),
+        option("A config, e.g. zoo_hparams/rigl/sac.yml, whose entry gets the best values too."),
     ] = None,
-    seed: Annotated[int, text("First seed of every trial, and the sampler's.")] = 0,
+    seed: Annotated[int, option("First seed of every trial, and the sampler's.")] = 0,
     n_timesteps: Steps = None,
     n_envs: Envs = None,
     hyperparams: Hyperparams = None,
@@ -207,7 +207,7 @@ def report(
     studies: Annotated[list[str], typer.Argument(help="Names of studies.", metavar="STUDY...")],
     storage: Storage = None,
     out: Annotated[
-        Path | None, text("The page.", shown="report.html in the first study's folder")
+        Path | None, option("The page.", shown="report.html in the first study's folder")
     ] = None,
     log_folder: LogFolder = Path("logs"),
 ) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from sb3_sparse.compress.result import Compression
-from sb3_sparse.compress.run import compress
+from sb3_sparse.compress.run import compress_model
 from sb3_sparse.compress.twin import sparsify
 
-__all__ = ["Compression", "compress", "sparsify"]
+__all__ = ["Compression", "compress_model", "sparsify"]

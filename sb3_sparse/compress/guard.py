@@ -11,7 +11,6 @@ import numpy as np
 from sb3_sparse.errors import ConfigError, MissingExtra
 
 CONFIDENCE = 0.95
-Verdict = Literal["passed", "failed", "undecided"]
 
 
 @dataclass(frozen=True)
@@ -65,7 +64,7 @@ def change(sparse: Sequence[float], baseline: Sequence[float]) -> Interval:
     return mean_interval(np.subtract(sparse, baseline).tolist())
 
 
-def judge(change: Interval, tolerance: float) -> Verdict:
+def judge(change: Interval, tolerance: float) -> Literal["passed", "failed", "undecided"]:
     """Whether a drop is shown to be tolerable (passed), shown not to be (failed), or neither.
 
     :param change: change of the mean return

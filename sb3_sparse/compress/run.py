@@ -10,12 +10,12 @@ from typing import Any
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
-from sb3_sparse.compress.bench import Bench
 from sb3_sparse.compress.evaluation import check_eval_env
 from sb3_sparse.compress.guard import change, mean_interval
+from sb3_sparse.compress.pruner import ModelPruner
+from sb3_sparse.compress.record import CompressionRecord, fingerprint, open_record
 from sb3_sparse.compress.result import Compression
 from sb3_sparse.compress.search import Rules, search
-from sb3_sparse.compress.state import State, fingerprint, open_state
 from sb3_sparse.compress.twin import sparsity_of
 from sb3_sparse.errors import ConfigError, CorruptStateError
 from sb3_sparse.sparsity.distributions import check_distribution, check_sparsity
@@ -26,7 +26,7 @@ FRESH = 1000
 """Batches from this number on decide nothing."""
 
 
-def compress(
+def compress_model(
     model: BaseAlgorithm,
     eval_env: VecEnv,
     folder: str | Path,
@@ -86,14 +86,14 @@ def compress(
         check_distribution(distribution)
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    state = open_state(folder, settings)
-    bench = Bench(
+    record = open_record(folder, settings)
+    pruner = ModelPruner(
         model, eval_env, folder, settings["steps"], episodes, seed, deterministic, distribution
     )
-    before = bench.nnz
+    before = pruner.nnz
     rules = Rules(
-        start=bench.sparsities[bench.network],
-        floor=bench.floor,
+        start=pruner.sparsities[pruner.network],
+        floor=pruner.floor,
         max_drop=settings["max_drop"],
         goal=settings["sparsity"],
         batches=BATCHES if settings["max_drop"] is not None else 1,
@@ -101,42 +101,42 @@ def compress(
     path = folder / f"{name}.zip"
     if rules.goal is not None and rules.goal <= rules.start:
         raise ConfigError(
-            f"sparsity={rules.goal} is not above the {rules.start} that the {bench.network} has "
+            f"sparsity={rules.goal} is not above the {rules.start} that the {pruner.network} has "
             "already; give more"
         )
     if rules.goal is not None and 1.0 - rules.goal < rules.floor:
         raise ConfigError(
             f"sparsity={rules.goal} leaves less than one connection a layer of the "
-            f"{bench.network}; allowed is up to {math.floor(1e4 * (1.0 - rules.floor)) / 1e4}"
+            f"{pruner.network}; allowed is up to {math.floor(1e4 * (1.0 - rules.floor)) / 1e4}"
         )
-    if state.finished and not path.is_file():
+    if record.finished and not path.is_file():
         raise CorruptStateError(
             f"the compression in {folder} is finished, but {path} is missing; remove the folder "
             "and begin anew"
         )
-    if state.finished:
+    if record.finished:
         say(f"The compression in {folder} is finished")
-        bench.clear()
-        return _outcome(state, bench, path, before)
-    if state.levels:
-        say(f"Going on after level {len(state.levels)}")
-    if state.accepted:
-        bench.restore(state.accepted)
+        pruner.clear()
+        return _outcome(record, pruner, path, before)
+    if record.levels:
+        say(f"Going on after level {len(record.levels)}")
+    if record.accepted:
+        pruner.restore(record.accepted)
 
     def save() -> None:
-        state.save(folder)
-        bench.forget_levels(state.accepted)
+        record.save(folder)
+        pruner.forget_levels(record.accepted)
 
-    search(rules, bench, state.baseline, state.levels, save, say)
-    bench.back_to_accepted()
-    if state.checked is None:
-        state.checked = _check(state, bench)
+    search(rules, pruner, record.baseline, record.levels, save, say)
+    pruner.back_to_accepted()
+    if record.checked is None:
+        record.checked = _check(record, pruner)
         save()
-    bench.finish(name)
-    state.finished = True
+    pruner.finish(name)
+    record.finished = True
     save()
-    bench.clear()
-    return _outcome(state, bench, path, before)
+    pruner.clear()
+    return _outcome(record, pruner, path, before)
 
 
 def _settings(
@@ -195,30 +195,32 @@ def _settings(
     }
 
 
-def _check(state: State, bench: Bench) -> tuple[list[float], list[float]]:
+def _check(record: CompressionRecord, pruner: ModelPruner) -> tuple[list[float], list[float]]:
     """Returns of outcome and baseline on fresh episodes, as many as it was accepted by."""
-    accepted = state.levels[state.accepted - 1] if state.accepted else None
-    wanted = len(accepted.returns) if accepted else bench.episodes
+    accepted = record.levels[record.accepted - 1] if record.accepted else None
+    wanted = len(accepted.returns) if accepted else pruner.episodes
     outcome: list[float] = []
     baseline: list[float] = []
     batch = FRESH
     while len(outcome) < wanted:
-        outcome += bench.returns(False, batch)
-        baseline += bench.returns(True, batch)
+        outcome += pruner.returns(False, batch)
+        baseline += pruner.returns(True, batch)
         batch += 1
     return outcome, baseline
 
 
-def _outcome(state: State, bench: Bench, path: Path, before: int) -> Compression:
-    assert state.checked is not None
-    outcome, baseline = state.checked
-    level = state.levels[state.accepted - 1] if state.accepted else None
-    sparsity = dict(bench.sparsities)
+def _outcome(
+    record: CompressionRecord, pruner: ModelPruner, path: Path, before: int
+) -> Compression:
+    assert record.checked is not None
+    outcome, baseline = record.checked
+    level = record.levels[record.accepted - 1] if record.accepted else None
+    sparsity = dict(pruner.sparsities)
     if level is not None:
-        sparsity[bench.network] = level.sparsity
+        sparsity[pruner.network] = level.sparsity
     return Compression(
         path=path,
-        network=bench.network,
+        network=pruner.network,
         sparsity=sparsity,
         nnz_before=before,
         nnz=before if level is None else level.nnz,
@@ -226,5 +228,5 @@ def _outcome(state: State, bench: Bench, path: Path, before: int) -> Compression
         outcome=mean_interval(outcome),
         change=change(outcome, baseline),
         episodes=len(outcome),
-        levels=tuple(state.levels),
+        levels=tuple(record.levels),
     )

@@ -81,7 +81,7 @@ def _sparsity(density: float) -> float:
     return round(1.0 - density, DIGITS)
 
 
-class Workbench(Protocol):
+class Pruner(Protocol):
     """What a search needs done."""
 
     def make(self, number: int, sparsity: float) -> int:
@@ -114,7 +114,7 @@ class Rules:
 
 def search(
     rules: Rules,
-    bench: Workbench,
+    pruner: Pruner,
     baseline: dict[int, list[float]],
     levels: list[Level],
     save: Callable[[], None],
@@ -130,7 +130,7 @@ def search(
 
     def baseline_of(batch: int) -> list[float]:
         if batch not in baseline:
-            baseline[batch] = bench.returns(True, batch)
+            baseline[batch] = pruner.returns(True, batch)
             save()
         return baseline[batch]
 
@@ -142,10 +142,10 @@ def search(
         if sparsity is None:
             return
         number = len(levels) + 1
-        nnz = bench.make(number, sparsity)
-        level = _judged(rules, bench, baseline_of, sparsity, nnz)
+        nnz = pruner.make(number, sparsity)
+        level = _judged(rules, pruner, baseline_of, sparsity, nnz)
         if level.accepted:
-            bench.accept(number)
+            pruner.accept(number)
         levels.append(level)
         save()
         say(f"Level {number}: {level}")
@@ -153,7 +153,7 @@ def search(
 
 def _judged(
     rules: Rules,
-    bench: Workbench,
+    pruner: Pruner,
     baseline_of: Callable[[int], list[float]],
     sparsity: float,
     nnz: int,
@@ -163,7 +163,7 @@ def _judged(
     whole: list[float] = []
     verdict = "undecided"
     for batch in range(rules.batches):
-        candidate += bench.returns(False, batch)
+        candidate += pruner.returns(False, batch)
         whole += baseline_of(batch)
         if rules.max_drop is None:
             verdict = "done"

@@ -25,7 +25,7 @@ from sb3_sparse.policies.saving import load_without_buffer, parts_of
 from sb3_sparse.sparsity.selection import largest
 
 Algorithm = TypeVar("Algorithm", bound=BaseAlgorithm)
-State = dict[str, th.Tensor]
+StateDict = dict[str, th.Tensor]
 
 MASK = ".weight_mask"
 
@@ -160,7 +160,7 @@ def _sparse_class(model: BaseAlgorithm) -> type[BaseSparsePolicy]:
     )
 
 
-def _pruned(model: BaseAlgorithm, data: Mapping[str, Any], saved: State) -> State:
+def _pruned(model: BaseAlgorithm, data: Mapping[str, Any], saved: StateDict) -> StateDict:
     """What the state_dict of the twin's policy shall be.
 
     :param data: what the twin is made from
@@ -194,7 +194,7 @@ def _pruned(model: BaseAlgorithm, data: Mapping[str, Any], saved: State) -> Stat
             )
         layer.set_mask(magnitude_mask(layer.dense(), active, layer.final_nnz))
         layer.mask_targets()
-    state: State = policy.state_dict()
+    state: StateDict = policy.state_dict()
     return state
 
 

@@ -10,9 +10,16 @@ if TYPE_CHECKING:
     from sb3_sparse.export.formats import FORMATS
     from sb3_sparse.export.observations import record_observations
     from sb3_sparse.export.parity import Parity, ParityError
-    from sb3_sparse.export.write import ExportReport, export
+    from sb3_sparse.export.write import ExportReport, export_policy
 
-__all__ = ["FORMATS", "ExportReport", "Parity", "ParityError", "export", "record_observations"]
+__all__ = [
+    "FORMATS",
+    "ExportReport",
+    "Parity",
+    "ParityError",
+    "export_policy",
+    "record_observations",
+]
 __getattr__, __dir__ = lazily(
     __name__,
     {
@@ -20,7 +27,7 @@ __getattr__, __dir__ = lazily(
         "ExportReport": "write",
         "Parity": "parity",
         "ParityError": "parity",
-        "export": "write",
+        "export_policy": "write",
         "record_observations": "observations",
     },
 )

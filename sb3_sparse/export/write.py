@@ -90,7 +90,7 @@ class ExportReport:
         return "\n".join([*lines, *(f"note: {note}" for note in self.notes)])
 
 
-def export(
+def export_policy(
     model: BaseAlgorithm,
     path: str | Path,
     to: str = "c",

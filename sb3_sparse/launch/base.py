@@ -13,7 +13,7 @@ from typing import Any
 
 from sb3_sparse.errors import ConfigError
 
-EVERY = 1.0
+POLL_SECONDS = 1.0
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Task:
 
 
 @dataclass(frozen=True)
-class Ended:
+class TaskResult:
     """A task that is over.
 
     :param task: which
@@ -68,7 +68,7 @@ class Launcher(ABC):
     """Runs tasks in processes of one thread each, and never more than so many at a time."""
 
     @abstractmethod
-    def run(self, tasks: Sequence[Task], workers: int) -> Generator[Ended | None, None, None]:
+    def run(self, tasks: Sequence[Task], workers: int) -> Generator[TaskResult | None, None, None]:
         """Run the tasks in their order; yields each that ends, and None once in a second without.
 
         A task that fails or whose process is killed takes no other with it. Closing the iterator

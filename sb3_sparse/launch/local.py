@@ -16,7 +16,7 @@ from threading import Thread
 from typing import IO
 
 from sb3_sparse.errors import ConfigError
-from sb3_sparse.launch.base import EVERY, Ended, Launcher, Task, check_workers
+from sb3_sparse.launch.base import POLL_SECONDS, Launcher, Task, TaskResult, check_workers
 from sb3_sparse.launch.jobs import Job, Plan
 
 SHOWN_LINES = 15
@@ -37,7 +37,7 @@ class LocalLauncher(Launcher):
                 f"an address ({address!r}) is Ray's; add --launcher ray, or leave it out"
             )
 
-    def run(self, tasks: Sequence[Task], workers: int) -> Generator[Ended | None, None, None]:
+    def run(self, tasks: Sequence[Task], workers: int) -> Generator[TaskResult | None, None, None]:
         """See :meth:`Launcher.run`."""
         check_workers(workers)
         with tempfile.TemporaryDirectory() as name:
@@ -48,7 +48,7 @@ class LocalLauncher(Launcher):
                 waiting = dict(enumerate(tasks))
                 while waiting:
                     try:
-                        answer = server.answers.get(timeout=EVERY)
+                        answer = server.answers.get(timeout=POLL_SECONDS)
                     except Empty:
                         yield None
                         continue
@@ -57,7 +57,7 @@ class LocalLauncher(Launcher):
                     number, code = map(int, answer.split())
                     yield _ended(waiting.pop(number), jobs[number], code)
             for task in waiting.values():  # nobody will run them
-                yield Ended(task, error=_error(server.process.returncode, output))
+                yield TaskResult(task, error=_error(server.process.returncode, output))
 
 
 class _Server:
@@ -111,11 +111,11 @@ def _job(files: Path, task: Task) -> Job:
     return Job(task.packed(), log.absolute(), files.with_suffix(".answer"))
 
 
-def _ended(task: Task, job: Job, code: int) -> Ended:
+def _ended(task: Task, job: Job, code: int) -> TaskResult:
     if job.answer.is_file():
         value, error = pickle.loads(job.answer.read_bytes())
-        return Ended(task, value, error)
-    return Ended(task, error=_error(code, job.log))
+        return TaskResult(task, value, error)
+    return TaskResult(task, error=_error(code, job.log))
 
 
 def _error(code: int, log: Path) -> str:

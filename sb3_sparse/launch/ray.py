@@ -9,7 +9,7 @@ from collections.abc import Generator, Sequence
 from typing import Any
 
 from sb3_sparse.errors import ConfigError, MissingExtra
-from sb3_sparse.launch.base import EVERY, Ended, Launcher, Task, check_workers
+from sb3_sparse.launch.base import POLL_SECONDS, Launcher, Task, TaskResult, check_workers
 
 PATIENCE = 10.0  # seconds for a cluster to answer
 GRACE = 60.0  # seconds for a task to stop when it is asked to
@@ -34,7 +34,7 @@ class RayLauncher(Launcher):
         self.ray = ray
         self.address = address
 
-    def run(self, tasks: Sequence[Task], workers: int) -> Generator[Ended | None, None, None]:
+    def run(self, tasks: Sequence[Task], workers: int) -> Generator[TaskResult | None, None, None]:
         """See :meth:`Launcher.run`."""
         check_workers(workers)
         ray, ours = self.ray, not self.ray.is_initialized()
@@ -48,7 +48,7 @@ class RayLauncher(Launcher):
                 while waiting and len(running) < workers:
                     task = waiting.pop()
                     running[call.remote(task.packed())] = task
-                done, _ = ray.wait(list(running), timeout=EVERY)
+                done, _ = ray.wait(list(running), timeout=POLL_SECONDS)
                 for reference in done:
                     yield self._ended(reference, running.pop(reference))
                 if not done:
@@ -79,12 +79,12 @@ class RayLauncher(Launcher):
                 "--head`, or leave the address out"
             ) from error
 
-    def _ended(self, reference: Any, task: Task) -> Ended:
+    def _ended(self, reference: Any, task: Task) -> TaskResult:
         try:
             value, error = self.ray.get(reference)
         except self.ray.exceptions.RayError as failure:
-            return Ended(task, error=f"Ray says: {failure}")
-        return Ended(task, value, error)
+            return TaskResult(task, error=f"Ray says: {failure}")
+        return TaskResult(task, value, error)
 
 
 def _reach(address: str) -> None:

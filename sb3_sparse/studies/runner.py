@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from sb3_sparse.errors import SparsityError, warn
-from sb3_sparse.launch.base import Ended, Launcher, Task
+from sb3_sparse.launch.base import Launcher, Task, TaskResult
 from sb3_sparse.studies.cell import Cell
 from sb3_sparse.studies.measures import FILES
 from sb3_sparse.studies.spec import Study
@@ -136,7 +136,7 @@ def _task(cell: Cell, store: Path) -> Task:
     return Task(cell.name, FUNCTION, {"cell": cell, "store": store.absolute()}, log)
 
 
-def _account(progress: Progress, cell: Cell, store: Path, ended: Ended, last: bool) -> None:
+def _account(progress: Progress, cell: Cell, store: Path, ended: TaskResult, last: bool) -> None:
     if ended.error is not None:
         path = cell.errors(store)
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -17,10 +17,10 @@ from sb3_sparse.studies.measures import FILES
 from sb3_sparse.studies.status import DONE, OVER, RUNNING, STOPPED, status_of
 from sb3_sparse.zoo.checkpoint import LOCK, locked
 from sb3_sparse.zoo.prepare import count
-from sb3_sparse.zoo.progress import TrainingProgress
 from sb3_sparse.zoo.record import DIVERGED, NAME, read_record, write_record
 from sb3_sparse.zoo.spec import RunSpec
 from sb3_sparse.zoo.training import resume, train
+from sb3_sparse.zoo.watch import TrainingLog
 
 
 def work_on(cell: Cell, store: Path) -> str:
@@ -66,7 +66,7 @@ def _trained(folder: Path) -> bool:
 def _train(cell: Cell, folder: Path) -> bool:
     """Train to the end; whether it was reached."""
     callbacks = cell.measures.callbacks(folder)
-    watch = TrainingProgress()  # into the cell's log
+    watch = TrainingLog()
     try:
         if (folder / NAME).is_file():
             return resume(folder, callbacks, watch).finished

@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
+import sys
+import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 from stable_baselines3.common.callbacks import BaseCallback
 
+from sb3_sparse.policies.base import BaseSparsePolicy
+from sb3_sparse.policies.compiled import unwrapped
+from sb3_sparse.zoo.computing import gradient_steps_of
 from sb3_sparse.zoo.match import Match
 
 
 class Watch(BaseCallback):
-    """A callback that is also told what happens outside of training. Here it does nothing."""
+    """A callback that is also told what happens outside training; this one does nothing."""
 
     def begins(self, folder: Path, match: Match | None) -> None:
-        """A run has its folder and its settings; from here on it can be gone on with.
+        """A run has its folder and its settings; from here on it can be resumed.
 
         :param match: what was built to match a sparse network's parameters
         """
@@ -39,6 +46,61 @@ class Watch(BaseCallback):
 
     def _on_step(self) -> bool:
         return True
+
+
+class TrainingLog(Watch):
+    """Prints each evaluation, each tenth of the training, and each set of episodes as a line.
+
+    :param say: prints a line; None: print to the standard output of this moment
+    """
+
+    def __init__(self, say: Callable[[str], None] | None = None) -> None:
+        super().__init__()
+        self.say = say or partial(print, file=sys.stdout, flush=True)
+
+    def begins(self, folder: Path, match: Match | None) -> None:
+        if match is not None:
+            self.say(str(match))
+
+    def evaluated(self, step: int, mean: float, std: float, best: float | None) -> None:
+        so_far = "no best yet, still too dense" if best is None else f"best so far {best:.1f}"
+        self.say(f"evaluated at step {step}: return {mean:.1f} ± {std:.1f}, {so_far}")
+
+    def plays(self, what: str, done: int, planned: int) -> None:
+        if done == 0:
+            self.say(f"{what}, episodes: {planned}")
+
+    def _on_training_start(self) -> None:
+        self.planned = self.model._total_timesteps
+        self.tenths = 0
+        policy = unwrapped(self.model.policy)
+        if isinstance(policy, BaseSparsePolicy):
+            sparse = [layer.is_sparse for layer in policy.sparse.layers]
+            if any(sparse):
+                self.say(f"{sum(sparse)} of {len(sparse)} layers in sparse storage")
+        self.say(f"Gradient steps: {gradient_steps_of(self.model)}")
+
+    def _on_step(self) -> bool:
+        done = min(self.num_timesteps, self.planned)
+        tenths = 10 * done // self.planned
+        if tenths > self.tenths:
+            self.tenths = tenths
+            self.say(f"{done} of {self.planned} steps, {self.status()}")
+        return True
+
+    def status(self) -> str:
+        """The return of the last episodes, the sparsity, and environment steps a second.
+
+        The time of evaluations counts, as in SB3's own ``time/fps``.
+        """
+        returns = [float(episode["r"]) for episode in self.model.ep_info_buffer or ()]
+        text = f"return {fmean(returns):.1f}" if returns else "return –"
+        policy = unwrapped(self.model.policy)
+        if isinstance(policy, BaseSparsePolicy):
+            text += f", sparsity {policy.sparse.sparsity:.2%}"
+        seconds = (time.time_ns() - self.model.start_time) / 1e9
+        done = self.model.num_timesteps - self.model._num_timesteps_at_start
+        return f"{text}, {done / seconds:.0f} steps a second" if done else text
 
 
 def counting(tell: Callable[[int], None]) -> Callable[[dict[str, Any], dict[str, Any]], None]:

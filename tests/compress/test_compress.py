@@ -17,8 +17,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from support import assert_masked, make
 
 from sb3_sparse import sparsify
-from sb3_sparse.compress import bench as bench_module
-from sb3_sparse.compress import compress, finetune
+from sb3_sparse.compress import compress_model, finetune
+from sb3_sparse.compress import pruner as pruner_module
 from sb3_sparse.compress.evaluation import check_eval_env, episode_returns
 from sb3_sparse.errors import ConfigError, CorruptStateError
 
@@ -42,7 +42,7 @@ def test_a_fixed_sparsity_ends_at_it_and_says_what_it_cost(tmp_path):
     model = trained()
     before = {key: value.clone() for key, value in model.policy.state_dict().items()}
     lines: list[str] = []
-    outcome = compress(
+    outcome = compress_model(
         model, cartpole(), tmp_path / "out", sparsity=0.7, say=lines.append, name="final", **QUICK
     )
     assert [level.sparsity for level in outcome.levels] == [0.4, 0.64, 0.7]
@@ -63,10 +63,10 @@ def test_a_fixed_sparsity_ends_at_it_and_says_what_it_cost(tmp_path):
     assert not (tmp_path / "out" / "levels").exists()
     for key, value in before.items():
         assert th.equal(value, model.policy.state_dict()[key]), key
-    again = compress(model, cartpole(), tmp_path / "out", sparsity=0.7, name="final", **QUICK)
+    again = compress_model(model, cartpole(), tmp_path / "out", sparsity=0.7, name="final", **QUICK)
     assert again == outcome
     with pytest.raises(ConfigError, match="seed 3 instead of 4"):
-        compress(
+        compress_model(
             model, cartpole(), tmp_path / "out", sparsity=0.7, name="final", **{**QUICK, "seed": 4}
         )
 
@@ -79,7 +79,7 @@ def test_a_guarded_search_ends_with_a_model_that_does_what_it_says(tmp_path):
     )  # fmt: skip
     model.learn(12_000)
     evaluation = make_vec_env("CartPole-v1", n_envs=5)
-    outcome = compress(model, evaluation, tmp_path, max_drop=0.5, steps=2048, episodes=5)
+    outcome = compress_model(model, evaluation, tmp_path, max_drop=0.5, steps=2048, episodes=5)
     passed = [level for level in outcome.levels if level.verdict == "passed"]
     assert passed
     for level in passed:
@@ -102,10 +102,10 @@ def test_an_interrupted_compression_comes_out_as_an_uninterrupted_one(
     def run(folder):
         model = trained(normalized)
         evaluation = cartpole(normalized=normalized, training=False)
-        return compress(model, evaluation, folder, sparsity=0.8, **QUICK)
+        return compress_model(model, evaluation, folder, sparsity=0.8, **QUICK)
 
     whole = run(tmp_path / "whole")
-    fine_tune, calls = bench_module.fine_tune, []
+    fine_tune, calls = pruner_module.fine_tune, []
 
     def interrupting(model, steps):
         calls.append(steps)
@@ -113,7 +113,7 @@ def test_an_interrupted_compression_comes_out_as_an_uninterrupted_one(
         if len(calls) in (1, 3):
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(bench_module, "fine_tune", interrupting)
+    monkeypatch.setattr(pruner_module, "fine_tune", interrupting)
     for _ in range(2):
         with pytest.raises(KeyboardInterrupt):
             run(tmp_path / "parts")
@@ -139,7 +139,7 @@ def test_normalisation_is_that_of_each_level(tmp_path):
     normalize = model.get_vec_normalize_env()
     before = normalize.obs_rms.count
     evaluation = cartpole(normalized=True, training=False)
-    compress(model, evaluation, tmp_path, sparsity=0.5, **QUICK)
+    compress_model(model, evaluation, tmp_path, sparsity=0.5, **QUICK)
     saved = VecNormalize.load(str(tmp_path / "model" / "vecnormalize.pkl"), cartpole())
     # two levels of 64 steps, and a reset of 2 environments before each
     assert saved.obs_rms.count == pytest.approx(before + 2 * (64 + 2))
@@ -152,7 +152,7 @@ def test_off_policy_models_get_experience_first(name, tmp_path, monkeypatch):
     env_id = "CartPole-v1" if name == "DQN" else "Pendulum-v1"
     cls = type(make(name))
     model = cls.load(tmp_path / "model", env=make_vec_env(env_id), device="cpu")
-    outcome = compress(model, make_vec_env(env_id), tmp_path / "out", sparsity=0.5, **QUICK)
+    outcome = compress_model(model, make_vec_env(env_id), tmp_path / "out", sparsity=0.5, **QUICK)
     loaded = cls.load(outcome.path, device="cpu")
     assert loaded.num_timesteps == 60 + 200 + 2 * 64
     assert model.replay_buffer.size() == 200 + 2 * 64
@@ -163,20 +163,22 @@ def test_off_policy_models_get_experience_first(name, tmp_path, monkeypatch):
 
 def test_a_sparse_model_goes_on_from_what_it_has(tmp_path):
     model = sparsify(trained(), {"actor": 0.8, "critic": 0.5})
-    outcome = compress(model, cartpole(), tmp_path, sparsity=0.9, **QUICK)
+    outcome = compress_model(model, cartpole(), tmp_path, sparsity=0.9, **QUICK)
     assert [level.sparsity for level in outcome.levels] == [0.88, 0.9]
     assert outcome.sparsity == {"actor": 0.9, "critic": 0.5}
     with pytest.raises(ConfigError, match=r"sparsity=0.8 is not above the 0.8 that the actor has"):
-        compress(model, cartpole(), tmp_path / "other", sparsity=0.8, **QUICK)
+        compress_model(model, cartpole(), tmp_path / "other", sparsity=0.8, **QUICK)
 
 
 def test_a_lost_model_is_missed(tmp_path, monkeypatch):
-    monkeypatch.setattr(bench_module.Bench, "finish", lambda *_: (_ for _ in ()).throw(KeyError))
+    monkeypatch.setattr(
+        pruner_module.ModelPruner, "finish", lambda *_: (_ for _ in ()).throw(KeyError)
+    )
     with pytest.raises(KeyError):
-        compress(trained(), cartpole(), tmp_path, sparsity=0.5, **QUICK)
+        compress_model(trained(), cartpole(), tmp_path, sparsity=0.5, **QUICK)
     (tmp_path / "levels" / "2.zip").unlink()
     with pytest.raises(CorruptStateError, match=r"2.zip is missing; remove"):
-        compress(trained(), cartpole(), tmp_path, sparsity=0.5, **QUICK)
+        compress_model(trained(), cartpole(), tmp_path, sparsity=0.5, **QUICK)
 
 
 def test_mistakes_are_named(tmp_path):
@@ -190,14 +192,14 @@ def test_mistakes_are_named(tmp_path):
         (dict(distribution="flat"), "unknown distribution 'flat'"),
     ):
         with pytest.raises(ConfigError, match=message):
-            compress(model, cartpole(), tmp_path / "out", **kwargs)
+            compress_model(model, cartpole(), tmp_path / "out", **kwargs)
     with pytest.raises(ConfigError, match="must both be normalised"):
-        compress(model, cartpole(normalized=True, training=False), tmp_path / "out")
+        compress_model(model, cartpole(normalized=True, training=False), tmp_path / "out")
     with pytest.raises(ConfigError, match="normalises rewards"):
-        compress(model, cartpole(normalized=True), tmp_path / "out")
+        compress_model(model, cartpole(normalized=True), tmp_path / "out")
     model.env = None
     with pytest.raises(ConfigError, match="no environment to be fine-tuned in"):
-        compress(model, cartpole(), tmp_path / "out")
+        compress_model(model, cartpole(), tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
@@ -259,13 +261,13 @@ def test_rewards_are_added_up_where_there_is_no_monitor():
 def test_each_model_is_evaluated_with_its_own_normalisation(tmp_path):
     model = trained(normalized=True)
     evaluation = cartpole(normalized=True, training=False)
-    bench = bench_module.Bench(model, evaluation, tmp_path, 64, 4, 0, True, None)
+    pruner = pruner_module.ModelPruner(model, evaluation, tmp_path, 64, 4, 0, True, None)
     before = model.get_vec_normalize_env().obs_rms.count
-    first = bench.returns(True, 0)
-    bench.make(1, 0.5)
-    bench.returns(False, 0)
+    first = pruner.returns(True, 0)
+    pruner.make(1, 0.5)
+    pruner.returns(False, 0)
     assert evaluation.obs_rms.count == model.get_vec_normalize_env().obs_rms.count > before + 64
-    assert bench.returns(True, 0) == first
+    assert pruner.returns(True, 0) == first
     assert evaluation.obs_rms.count == before
 
 
@@ -274,7 +276,7 @@ def test_normalisation_of_rewards_alone(tmp_path):
     evaluation = make_vec_env("CartPole-v1", n_envs=2)
     evaluation = VecNormalize(evaluation, training=False, norm_obs=False, norm_reward=False)
     model = make("PPO", env=env, policy="MlpPolicy").learn(64)
-    outcome = compress(model, evaluation, tmp_path, sparsity=0.5, **QUICK)
+    outcome = compress_model(model, evaluation, tmp_path, sparsity=0.5, **QUICK)
     assert outcome.sparsity["actor"] == 0.5
     assert (tmp_path / "model" / "vecnormalize.pkl").is_file()
 
@@ -282,7 +284,7 @@ def test_normalisation_of_rewards_alone(tmp_path):
 def test_a_sparsity_that_leaves_layers_empty_is_refused(tmp_path):
     # 4-24-24-2 has three layers, so at least 3 of 720 connections: 99.58 %
     with pytest.raises(ConfigError, match=r"sparsity=0.9999 leaves less.*allowed is up to 0.9958"):
-        compress(trained(), cartpole(), tmp_path, sparsity=0.9999, **QUICK)
+        compress_model(trained(), cartpole(), tmp_path, sparsity=0.9999, **QUICK)
 
 
 def test_a_first_look_binds_nobody(tmp_path, monkeypatch):
@@ -292,14 +294,14 @@ def test_a_first_look_binds_nobody(tmp_path, monkeypatch):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(bench_module, "fine_tune", stop)
+        patch.setattr(pruner_module, "fine_tune", stop)
         with pytest.raises(KeyboardInterrupt):
-            compress(model, cartpole(), tmp_path, sparsity=0.4, **QUICK)
+            compress_model(model, cartpole(), tmp_path, sparsity=0.4, **QUICK)
     other = {**QUICK, "episodes": 6}
-    outcome = compress(model, cartpole(), str(tmp_path), sparsity=0.4, **other)
+    outcome = compress_model(model, cartpole(), str(tmp_path), sparsity=0.4, **other)
     assert outcome.episodes == 6
     outcome.path.unlink()
     with pytest.raises(CorruptStateError, match="is finished, but .*model.zip is missing"):
-        compress(model, cartpole(), tmp_path, sparsity=0.4, **other)
+        compress_model(model, cartpole(), tmp_path, sparsity=0.4, **other)
     with pytest.raises(ConfigError, match="must be a VecEnv, got"):
-        compress(model, gym.make("CartPole-v1").env, tmp_path, sparsity=0.4, **other)
+        compress_model(model, gym.make("CartPole-v1").env, tmp_path, sparsity=0.4, **other)

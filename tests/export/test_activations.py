@@ -12,7 +12,7 @@ from support import make
 from torch import nn
 
 from sb3_sparse.errors import UnsupportedError
-from sb3_sparse.export import export
+from sb3_sparse.export import export_policy
 from sb3_sparse.export.activations import FORMULAS
 from sb3_sparse.export.artifact import c_artifact, numpy_artifact, onnx_artifact
 from sb3_sparse.export.fold import fold
@@ -104,10 +104,10 @@ def test_whole_policies_act_as_the_model(activation, algorithm, to, tmp_path):
     model = make(algorithm, policy_kwargs=kwargs)
     for parameter in model.policy.parameters():
         parameter.data.mul_(1.5)
-    report = export(model, tmp_path / "policy", to)
+    report = export_policy(model, tmp_path / "policy", to)
     assert report.parity.holds
     if to == "c":
-        report = export(model, tmp_path / "int8", "c", int8=True)
+        report = export_policy(model, tmp_path / "int8", "c", int8=True)
         assert report.parity.holds
         assert report.rounding is not None
 
@@ -120,7 +120,7 @@ def test_slopes_of_units_go_with_their_units(tmp_path):
         if isinstance(module, nn.PReLU):
             module.weight.data = th.linspace(-1.0, 2.0, 24)
     for to in ("c", "numpy", "onnx"):
-        report = export(model, tmp_path / "policy", to)
+        report = export_policy(model, tmp_path / "policy", to)
         assert report.parity.holds
         assert report.removed_units > 0
 
@@ -151,7 +151,7 @@ class SquaredReLU(nn.ReLU):
 @pytest.mark.parametrize("to", ["c", "numpy", "onnx"])
 def test_activations_of_ones_own(activation, to, tmp_path):
     model = make("SAC", policy_kwargs=dict(activation_fn=activation, sparsity=0.5))
-    assert export(model, tmp_path / "policy", to).parity.holds
+    assert export_policy(model, tmp_path / "policy", to).parity.holds
 
 
 class Normed(OwnExtractor):
@@ -173,7 +173,7 @@ def test_layer_normalisation(to, tmp_path):
         if isinstance(module, nn.LayerNorm):
             for parameter in module.parameters():
                 parameter.data.uniform_(-1, 2)
-    assert export(model, tmp_path / "policy", to).parity.holds
+    assert export_policy(model, tmp_path / "policy", to).parity.holds
 
 
 def test_a_layer_is_standardised_by_hand():
@@ -201,7 +201,7 @@ class Blocks(OwnExtractor):
 def test_what_people_write_in_a_forward(extractor, to, tmp_path):
     kwargs = dict(features_extractor_class=extractor)
     model = make("PPO", Task(VECTOR, spaces.Box(-1, 1, (2,))), "MlpPolicy", policy_kwargs=kwargs)
-    assert export(model, tmp_path / "policy", to).parity.holds
+    assert export_policy(model, tmp_path / "policy", to).parity.holds
 
 
 class Noisy(nn.Linear):
@@ -251,11 +251,11 @@ def test_a_refusal_names_the_module(extractor, message, to, tmp_path):
     kwargs = dict(features_extractor_class=extractor)
     model = make("PPO", Task(VECTOR, spaces.Box(-1, 1, (2,))), "MlpPolicy", policy_kwargs=kwargs)
     with pytest.raises(UnsupportedError, match=message):
-        export(model, tmp_path / "policy", to)
+        export_policy(model, tmp_path / "policy", to)
 
 
 @pytest.mark.filterwarnings("ignore:Implicit dimension")
 def test_an_activation_that_cannot_be_exported_is_named_with_what_can(tmp_path):
     model = make("SAC", policy_kwargs=dict(activation_fn=nn.Softmax))
     with pytest.raises(UnsupportedError, match=r"^actor.latent_pi.1 \(Softmax\) cannot .*GELU"):
-        export(model, tmp_path / "policy")
+        export_policy(model, tmp_path / "policy")

@@ -15,7 +15,7 @@ from support import TinyImages, make
 
 from sb3_sparse import SparsityCallback
 from sb3_sparse.errors import UnsupportedError
-from sb3_sparse.export import export, numpy_policy
+from sb3_sparse.export import export_policy, numpy_policy
 
 BLOCKED = """
 import sys
@@ -54,7 +54,7 @@ def test_the_loader_is_short_and_needs_numpy_only():
 )
 def test_the_loader_runs_with_and_without_scipy(algorithm, env, blocked, tmp_path):
     model = make(algorithm, env, policy_kwargs=dict(sparsity=0.8))
-    export(model, tmp_path / "policy", "numpy")
+    export_policy(model, tmp_path / "policy", "numpy")
     assert {path.name for path in tmp_path.iterdir()} == {"policy.npz", "numpy_policy.py"}
     model.observation_space.seed(0)
     seen = np.stack([model.observation_space.sample() for _ in range(6)])
@@ -101,7 +101,7 @@ def test_dense_zips_go_on_training_without_this_package(tmp_path):
     for name in ("PPO", "SAC", "DQN", "CrossQ"):
         model = models[name] = make(name, learning_rate=lambda progress: 1e-3 * progress)
         model.learn(64, callback=SparsityCallback("rigl", update_interval=3))
-        export(model, tmp_path / name, "dense")
+        export_policy(model, tmp_path / name, "dense")
         seen = np.random.default_rng(0).normal(size=(20, *model.observation_space.shape))
         np.save(tmp_path / f"{name}_seen.npy", seen.astype(np.float32))
         cases.append((name, model.env.envs[0].unwrapped.spec.id))
@@ -115,7 +115,7 @@ def test_dense_zips_go_on_training_without_this_package(tmp_path):
 def test_a_dense_zip_keeps_each_moment_with_its_weight(tmp_path):
     model = make("SAC", policy_kwargs=dict(compute="sparse"))
     model.learn(60)
-    report = export(model, tmp_path / "dense", "dense")
+    report = export_policy(model, tmp_path / "dense", "dense")
     assert report.nnz == sum(int(layer.mask().sum()) for layer in model.policy.sparse.layers)
     stock = type(model).load(tmp_path / "dense.zip")
     sparse = dict(model.policy.actor.named_parameters())
@@ -135,7 +135,7 @@ def test_a_dense_zip_keeps_each_moment_with_its_weight(tmp_path):
 def test_a_dense_zip_cannot_hold_networks_of_this_package(tmp_path):
     kwargs = dict(features_extractor_class="sb3_sparse.networks.ScaledNatureCNN")
     with pytest.raises(UnsupportedError, match="policy_kwargs.*needs sb3_sparse"):
-        export(make("DQN", TinyImages(), policy_kwargs=kwargs), tmp_path / "dense", "dense")
+        export_policy(make("DQN", TinyImages(), policy_kwargs=kwargs), tmp_path / "dense", "dense")
     assert not list(tmp_path.iterdir())
 
 
@@ -146,10 +146,10 @@ def test_two_exports_of_a_model_are_the_same_to_the_byte(tmp_path):
     code = """
 import sb3_sparse, sys
 from stable_baselines3 import PPO
-from sb3_sparse.export import FORMATS, export
+from sb3_sparse.export import FORMATS, export_policy
 model = PPO.load("../model.zip")
 for to in FORMATS:
-    export(model, to, to)
+    export_policy(model, to, to)
 """
     for seed in "12":
         (tmp_path / seed).mkdir()
@@ -179,14 +179,16 @@ def contents(path):
 
 
 def test_a_schedule_written_in_a_script_works_in_a_dense_zip(tmp_path):
-    export(make("PPO", learning_rate=lambda progress: 1e-3 * progress), tmp_path / "d", "dense")
+    export_policy(
+        make("PPO", learning_rate=lambda progress: 1e-3 * progress), tmp_path / "d", "dense"
+    )
     loaded = make("PPO").load(tmp_path / "d.zip")
     assert loaded.lr_schedule(0.5) == 5e-4
 
 
 @pytest.mark.parametrize("env", ["CartPole-v1", TinyImages()], ids=["vectors", "images"])
 def test_onnx_models_name_their_input_and_output(env, tmp_path):
-    export(make("DQN", env), tmp_path / "policy", "onnx")
+    export_policy(make("DQN", env), tmp_path / "policy", "onnx")
     model = onnx.load(tmp_path / "policy.onnx")
     (obs,), (action,) = model.graph.input, model.graph.output
     images = env != "CartPole-v1"

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import TinyImages, make
 
-from sb3_sparse.export import export
+from sb3_sparse.export import export_policy
 from sb3_sparse.export.artifact import OPTIONS, compiled
 from sb3_sparse.export.c import write_c
 from sb3_sparse.export.extract import graph_of
@@ -58,14 +58,14 @@ def works(*options):
 def test_no_compiler_warns(models, kind, int8, options, tmp_path):
     if not works(*options):
         pytest.skip(f"the compiler cannot {options[0]} here (Debian: gcc-multilib)")
-    export(models[kind], tmp_path / "policy", "c", int8=int8)
+    export_policy(models[kind], tmp_path / "policy", "c", int8=int8)
     assert compiles(tmp_path / "policy.c", *options) == ""
 
 
 @pytest.mark.parametrize("int8", [False, True])
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_file_states_its_flash_and_ram(models, kind, int8, tmp_path):
-    report = export(models[kind], tmp_path / "policy", "c", int8=int8)
+    report = export_policy(models[kind], tmp_path / "policy", "c", int8=int8)
     source = (tmp_path / "policy.c").read_text()
     arrays = re.findall(r"static const (\w+) \w+\[(\d+)\] = \{(.*?)\}", source, re.S)
     assert all(len(numbers.split(",")) == int(size) for _, size, numbers in arrays)
@@ -121,9 +121,9 @@ def test_eight_bits_by_hand():
 
 def test_eight_bit_weights_act_as_the_rounded_weights_do(tmp_path):
     model = make("SAC", policy_kwargs={"sparsity": 0.5})
-    report = export(model, tmp_path / "policy", "c", int8=True)
+    report = export_policy(model, tmp_path / "policy", "c", int8=True)
     assert report.parity.difference < 1e-5 < report.rounding.difference < 0.1
-    floats = export(model, tmp_path / "floats", "c")
+    floats = export_policy(model, tmp_path / "floats", "c")
     assert report.sizes["flash"] < floats.sizes["flash"]
     graph = quantized(graph_of(model, None))
     observations = np.random.default_rng(0).normal(size=(30, 3)).astype(np.float32)
@@ -179,7 +179,7 @@ def check_memory(graph: Graph):
 
 def test_a_main_function_can_step_the_policy(tmp_path):
     model = make("SAC")
-    export(model, tmp_path / "policy", "c")
+    export_policy(model, tmp_path / "policy", "c")
     (tmp_path / "main.c").write_text(
         """
         #include <stdio.h>

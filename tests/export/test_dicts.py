@@ -15,7 +15,7 @@ from torch import nn
 
 from sb3_sparse import sparsify
 from sb3_sparse.errors import ConfigError, UnsupportedError
-from sb3_sparse.export import FORMATS, export, record_observations
+from sb3_sparse.export import FORMATS, export_policy, record_observations
 from sb3_sparse.export.artifact import compiled, predictor
 from sb3_sparse.export.extract import graph_of
 from sb3_sparse.export.fold import fold
@@ -51,7 +51,7 @@ def test_dense_zips_act_as_the_model_row_by_row(algorithm, keys, tmp_path):
     action = THREE if algorithm in ("DQN", "QRDQN") else TORQUE
     model = make(algorithm, Task(dicts(keys), action), policy_kwargs=dict(sparsity=0.6))
     seen = samples(model.observation_space, 7)  # 7 is a multiple of no number of keys but 1
-    report = export(model, tmp_path / "dense", "dense", observations=seen)
+    report = export_policy(model, tmp_path / "dense", "dense", observations=seen)
     assert report.parity.holds
     assert (report.parity.recorded, report.parity.random) == (7, 1000)
     stock = type(model).load(tmp_path / "dense.zip")
@@ -66,13 +66,13 @@ def test_dense_zips_act_as_the_model_row_by_row(algorithm, keys, tmp_path):
 
 def test_images_among_the_keys(tmp_path):
     model = make("PPO", "TinyDicts-v0")
-    report = export(model, tmp_path / "dense", "dense")
+    report = export_policy(model, tmp_path / "dense", "dense")
     assert report.parity.holds
     assert report.parity.random == 100
     seen = record_observations(model, DummyVecEnv([lambda: model.env.envs[0].unwrapped]), 5)
     assert seen["image"].shape == (5, 1, 36, 36)
     for to in FORMATS:
-        report = export(model, tmp_path / to, to, observations=seen)
+        report = export_policy(model, tmp_path / to, to, observations=seen)
         assert report.parity.holds
         assert report.parity.recorded == 5
 
@@ -90,10 +90,10 @@ def test_every_other_format_acts_as_the_model(algorithm, keys, tmp_path):
     model = make(algorithm, Task(dicts(keys), action), policy_kwargs=dict(sparsity=0.6))
     seen = samples(model.observation_space, 7)
     for to in ("c", "numpy", "onnx"):
-        report = export(model, tmp_path / "policy", to, observations=seen)
+        report = export_policy(model, tmp_path / "policy", to, observations=seen)
         assert report.parity.holds
         assert (report.parity.recorded, report.parity.random) == (7, 1000)
-    assert export(model, tmp_path / "int8", "c", int8=True).parity.holds
+    assert export_policy(model, tmp_path / "int8", "c", int8=True).parity.holds
 
 
 @pytest.fixture(scope="module")
@@ -108,7 +108,7 @@ def mixed():
 
 def test_numpy_takes_one_dict_or_many(mixed, tmp_path):
     model, seen, expected = mixed
-    export(model, tmp_path / "policy", "numpy")
+    export_policy(model, tmp_path / "policy", "numpy")
     policy = Policy(tmp_path / "policy.npz")
     np.testing.assert_allclose(policy(seen), expected, atol=1e-5)
     one = policy({key: part[2] for key, part in seen.items()})
@@ -119,7 +119,7 @@ def test_numpy_takes_one_dict_or_many(mixed, tmp_path):
 
 def test_onnx_has_an_input_for_each_key(mixed, tmp_path):
     model, seen, expected = mixed
-    export(model, tmp_path / "policy", "onnx")
+    export_policy(model, tmp_path / "policy", "onnx")
     session = onnxruntime.InferenceSession(tmp_path / "policy.onnx")
     asked = {one.name: (one.type, tuple(one.shape)) for one in session.get_inputs()}
     assert asked["eye"] == ("tensor(uint8)", ("batch", 3, 36, 36))
@@ -132,7 +132,7 @@ def test_onnx_has_an_input_for_each_key(mixed, tmp_path):
 
 def test_c_takes_the_parts_behind_each_other_in_the_order_that_it_names(mixed, tmp_path):
     model, seen, expected = mixed
-    export(model, tmp_path / "policy", "c")
+    export_policy(model, tmp_path / "policy", "c")
     text = (tmp_path / "policy.h").read_text().replace("\n * ", " ")
     order = sorted(model.observation_space.spaces)  # as gymnasium has it
     assert order == ["choices", "eye", "matrix", "one of five", "switches", "vector"]
@@ -153,7 +153,7 @@ def test_c_takes_the_parts_behind_each_other_in_the_order_that_it_names(mixed, t
 def test_numbers_of_states_are_one_hot_inside(space, algorithm, to, tmp_path):
     action = THREE if algorithm == "DQN" else TORQUE
     model = make(algorithm, Task(space, action), policy_kwargs=dict(sparsity=0.5))
-    assert export(model, tmp_path / "policy", to).parity.holds
+    assert export_policy(model, tmp_path / "policy", to).parity.holds
     if to == "numpy":
         state = 4 if isinstance(space, spaces.Discrete) else np.array([2, 3])
         expected, _ = model.predict(np.array(state), deterministic=True)
@@ -178,7 +178,7 @@ class OwnCombination(BaseFeaturesExtractor):
 def test_a_combination_of_ones_own(to, tmp_path):
     kwargs = dict(features_extractor_class=OwnCombination)
     model = make("PPO", Task(dicts(2), TORQUE), "MultiInputPolicy", policy_kwargs=kwargs)
-    assert export(model, tmp_path / "policy", to).parity.holds
+    assert export_policy(model, tmp_path / "policy", to).parity.holds
 
 
 class Backwards(OwnCombination):
@@ -195,7 +195,7 @@ def test_parts_in_another_order_are_not_taken_for_the_observation(tmp_path):
     kwargs = dict(features_extractor_class=Backwards)
     model = make("PPO", Task(space, TORQUE), "MultiInputPolicy", policy_kwargs=kwargs)
     for to in ("c", "numpy", "onnx"):
-        assert export(model, tmp_path / "policy", to).parity.holds
+        assert export_policy(model, tmp_path / "policy", to).parity.holds
 
 
 def test_parts_that_are_passed_on_as_they_are_cost_nothing(tmp_path):
@@ -211,7 +211,7 @@ def test_dicts_that_cannot_be_exported_are_refused(tmp_path):
     model = make("PPO", Task(VECTOR, TORQUE))
     model.observation_space = spaces.Dict(a=PARTS["vector"], grid=grid)
     with pytest.raises(UnsupportedError, match=r"MultiDiscrete \(of one axis\)"):
-        export(model, tmp_path / "policy")
+        export_policy(model, tmp_path / "policy")
 
 
 def test_recorded_dicts_must_be_of_the_policys_keys_shapes_and_rows(tmp_path):
@@ -225,7 +225,7 @@ def test_recorded_dicts_must_be_of_the_policys_keys_shapes_and_rows(tmp_path):
         ({**seen, "vector": seen["vector"] * np.nan}, r"\['vector'\] must be finite"),
     ):
         with pytest.raises(ConfigError, match=message):
-            export(model, tmp_path / "dense", "dense", observations=wrong)
+            export_policy(model, tmp_path / "dense", "dense", observations=wrong)
 
 
 def test_an_environment_of_other_keys_is_refused():
@@ -245,7 +245,7 @@ def test_normalised_and_stacked_dicts(tmp_path):
     seen = record_observations(model, normalised, 10)
     assert np.abs(seen["b"]).max() > 2  # raw
     for to in FORMATS:
-        report = export(model, tmp_path / to, to, observations=seen)
+        report = export_policy(model, tmp_path / to, to, observations=seen)
         assert report.parity.holds
         assert ("does not normalise" in str(report)) == (to == "dense")
     policy = Policy(tmp_path / "numpy.npz")
@@ -254,14 +254,16 @@ def test_normalised_and_stacked_dicts(tmp_path):
     np.testing.assert_allclose(policy(raw), expected, atol=1e-5)
     other = VecNormalize(DummyVecEnv([lambda: Task(dicts(1), TORQUE)]))
     with pytest.raises(ConfigError, match=r"a dict of shapes .*\(7,\).*those in Dict"):
-        export(model, tmp_path / "other", "c", vecnormalize=other)
+        export_policy(model, tmp_path / "other", "c", vecnormalize=other)
     stacked = VecFrameStack(VecNormalize(DummyVecEnv([lambda: Task(space, TORQUE)])), 3)
     model = make("PPO", stacked)
     seen = record_observations(model, stacked, 10)
     assert {key: part.shape for key, part in seen.items()} == {"a": (10, 21), "b": (10, 6)}
-    assert export(model, tmp_path / "stacked", "dense", observations=seen).parity.recorded == 10
+    assert (
+        export_policy(model, tmp_path / "stacked", "dense", observations=seen).parity.recorded == 10
+    )
     with pytest.raises(ConfigError, match="'dense' only"):
-        export(model, tmp_path / "stacked", "c", observations=seen)
+        export_policy(model, tmp_path / "stacked", "c", observations=seen)
 
 
 def hindsight(algorithm, **arguments):
@@ -275,13 +277,13 @@ def hindsight(algorithm, **arguments):
 @pytest.mark.parametrize("algorithm", ["DQN", "SAC", "TD3", "TQC"])
 def test_models_of_hindsight_experience_replay(algorithm, tmp_path):
     model = hindsight(algorithm)
-    assert export(model, tmp_path / "dense", "dense").parity.holds
+    assert export_policy(model, tmp_path / "dense", "dense").parity.holds
     model.save(tmp_path / "model.zip")
     alone = load_without_buffer(type(model), tmp_path / "model.zip")
     assert alone.env is None
     assert alone.replay_buffer is None
     for to in FORMATS:
-        assert export(alone, tmp_path / "again", to).parity.holds
+        assert export_policy(alone, tmp_path / "again", to).parity.holds
     twin = sparsify(alone, 0.95)
     seen = samples(model.observation_space, 3)
     assert twin.predict(seen, deterministic=True)[0].shape[0] == 3
@@ -300,7 +302,7 @@ def test_a_dense_zip_of_a_loaded_model_keeps_the_settings_of_its_replay_buffer(a
     )
     model.save(tmp_path / "model.zip")
     alone = load_without_buffer(type(model), tmp_path / "model.zip")
-    export(alone, tmp_path / "dense", "dense")
+    export_policy(alone, tmp_path / "dense", "dense")
     stock = type(model).load(tmp_path / "dense.zip")
     assert stock.buffer_size == 777
     assert stock.optimize_memory_usage

@@ -8,7 +8,7 @@ from export.tools import VECTOR, OwnExtractor, Task
 from gymnasium import spaces
 from support import ALGORITHMS, TinyImages, make
 
-from sb3_sparse.export import FORMATS, export
+from sb3_sparse.export import FORMATS, export_policy
 from sb3_sparse.export.artifact import compiled
 from sb3_sparse.export.extract import graph_of
 from sb3_sparse.export.numpy_policy import Policy
@@ -58,7 +58,7 @@ def act(path, to, model, observations):
 
 
 def check(model, folder, to):
-    report = export(model, folder / "policy", to)
+    report = export_policy(model, folder / "policy", to)
     observations = observations_of(model)
     expected, _ = model.predict(observations, deterministic=True)
     found = act(folder / "policy", to, model, observations)

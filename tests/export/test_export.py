@@ -22,7 +22,7 @@ from sb3_sparse.errors import (
     SparsityError,
     UnsupportedError,
 )
-from sb3_sparse.export import FORMATS, ParityError, export, record_observations
+from sb3_sparse.export import FORMATS, ParityError, export_policy, record_observations
 from sb3_sparse.export.artifact import compiled
 from sb3_sparse.export.extract import graph_of
 from sb3_sparse.export.parity import compare
@@ -49,7 +49,7 @@ def written(folder):
 @pytest.mark.parametrize("to", ["c", "numpy", "onnx"])
 def test_normalisation_is_inside(to, tmp_path):
     model = normalised()
-    report = export(model, tmp_path / "policy", to)
+    report = export_policy(model, tmp_path / "policy", to)
     assert report.parity.holds
     if to == "c":
         act = compiled((tmp_path / "policy.c").read_text(), graph_of(model, None))
@@ -64,7 +64,7 @@ def test_normalisation_far_from_zero_is_as_exact_as_near(tmp_path):
     model = normalised()
     rms = model.get_vec_normalize_env().obs_rms
     rms.mean, rms.var = np.array([1e4, -3e3, 0.1]), np.array([1e-6, 1e-4, 1.0])
-    report = export(model, tmp_path / "policy", "c")
+    report = export_policy(model, tmp_path / "policy", "c")
     assert report.parity.difference < 1e-5
     assert "mean_1[3] = {\n    10000.0f, -3000.0f, 0.1f" in (tmp_path / "policy.c").read_text()
 
@@ -76,36 +76,36 @@ def test_statistics_may_be_given_as_a_file_or_an_object(tmp_path):
     model.env = model._vec_normalize_env = None
     contents = []
     for number, given in enumerate([normalization, tmp_path / "vecnormalize.pkl"]):
-        export(model, tmp_path / str(number), "c", vecnormalize=given)
+        export_policy(model, tmp_path / str(number), "c", vecnormalize=given)
         contents.append((tmp_path / f"{number}.c").read_bytes())
     assert contents[0] == contents[1]
-    export(model, tmp_path / "without", "c")
+    export_policy(model, tmp_path / "without", "c")
     assert (tmp_path / "without.c").read_bytes() != contents[0]
 
 
 def test_normalisation_of_rewards_alone_is_none(tmp_path):
-    export(normalised(norm_obs=False), tmp_path / "policy", "c")
+    export_policy(normalised(norm_obs=False), tmp_path / "policy", "c")
     assert "normalize" not in (tmp_path / "policy.c").read_text()
 
 
 def test_statistics_of_another_environment_are_refused(model, tmp_path):
     other = VecNormalize(DummyVecEnv([lambda: gym.make("CartPole-v1")]))
     with pytest.raises(ConfigError, match=r"shape \(4,\), the policy takes shape \(3,\)"):
-        export(model, tmp_path / "policy", "c", vecnormalize=other)
+        export_policy(model, tmp_path / "policy", "c", vecnormalize=other)
     for content in (pickle.dumps([1]), b"config: 1\nfoo\n", b"no pickle"):
         (tmp_path / "other.pkl").write_bytes(content)
         with pytest.raises(SparsityError, match="other.pkl .*give what VecNormalize.save wrote"):
-            export(model, tmp_path / "policy", "c", vecnormalize=tmp_path / "other.pkl")
+            export_policy(model, tmp_path / "policy", "c", vecnormalize=tmp_path / "other.pkl")
     assert written(tmp_path) == ["other.pkl"]
 
 
 def test_what_somebody_wrote_to_an_inactive_connection_is_not_exported(tmp_path):
     model = make("SAC", policy_kwargs=dict(compute="masked"))
-    clean = export(model, tmp_path / "clean", "numpy")
+    clean = export_policy(model, tmp_path / "clean", "numpy")
     layer = next(iter(model.policy.sparse.layers))
     flat = layer.weight.data.view(-1)
     flat[int(np.flatnonzero(~layer.mask())[0])] = 0.5
-    written_to = export(model, tmp_path / "written", "numpy")
+    written_to = export_policy(model, tmp_path / "written", "numpy")
     assert written_to.nnz == clean.nnz
     assert written_to.parity.holds
 
@@ -114,7 +114,7 @@ def test_weights_that_are_not_finite_are_refused(tmp_path):
     model = make("PPO", policy="MlpPolicy")
     model.policy.action_net.bias.data[0] = th.nan
     with pytest.raises(Diverged, match="values of action_net.bias are not finite"):
-        export(model, tmp_path / "policy")
+        export_policy(model, tmp_path / "policy")
 
 
 @pytest.mark.parametrize("to", FORMATS)
@@ -122,47 +122,47 @@ def test_weights_that_are_not_float32_are_refused(to, tmp_path):
     model = make("PPO", policy="MlpPolicy")
     model.policy.double()
     with pytest.raises(UnsupportedError, match=r"is of torch.float64.*policy.float\(\) before"):
-        export(model, tmp_path / "policy", to)
+        export_policy(model, tmp_path / "policy", to)
 
 
 def test_a_dense_zip_that_stock_sb3_cannot_load_is_not_written(tmp_path):
     model = make("TD3", policy="MlpPolicy")
     nn.utils.parametrizations.spectral_norm(model.policy.actor.mu[0])
     with pytest.raises(ParityError, match="cannot load the policy.*parametrized or replaced later"):
-        export(model, tmp_path / "policy", "dense", force=True)
+        export_policy(model, tmp_path / "policy", "dense", force=True)
     assert written(tmp_path) == []
-    assert export(model, tmp_path / "policy", "c").parity.holds
+    assert export_policy(model, tmp_path / "policy", "c").parity.holds
 
 
 def test_other_algorithms_are_refused(tmp_path):
     model = RecurrentPPO("MlpLstmPolicy", "CartPole-v1")
     with pytest.raises(UnsupportedError, match="a model of RecurrentPPO cannot be exported.*SAC"):
-        export(model, tmp_path / "policy")
+        export_policy(model, tmp_path / "policy")
 
 
 def test_networks_that_do_anything_else_are_refused(tmp_path):
     kwargs = dict(features_extractor_class=OddExtractor)
     model = make("PPO", Task(VECTOR, spaces.Discrete(2)), policy_kwargs=kwargs)
     with pytest.raises(UnsupportedError, match=r"\(OddExtractor\) .*norm.*allowed are Linear"):
-        export(model, tmp_path / "policy")
+        export_policy(model, tmp_path / "policy")
 
 
 def test_arguments_are_checked(model, tmp_path):
     with pytest.raises(ConfigError, match="to must be one of 'c', 'numpy'.*got 'tflite'"):
-        export(model, tmp_path / "policy", "tflite")
+        export_policy(model, tmp_path / "policy", "tflite")
     with pytest.raises(ConfigError, match="int8 is for to='c' only, got to='onnx'"):
-        export(model, tmp_path / "policy", "onnx", int8=True)
+        export_policy(model, tmp_path / "policy", "onnx", int8=True)
     with pytest.raises(ConfigError, match=r"must end in .onnx, got .*policy.c"):
-        export(model, tmp_path / "policy.c", "onnx")
+        export_policy(model, tmp_path / "policy.c", "onnx")
     with pytest.raises(ConfigError, match=r"of shape \(3,\).*got an array of shape \(5, 4\)"):
-        export(model, tmp_path / "policy", observations=np.zeros((5, 4)))
+        export_policy(model, tmp_path / "policy", observations=np.zeros((5, 4)))
     assert written(tmp_path) == []
 
 
 def test_where_files_go(model, tmp_path):
-    export(model, tmp_path, "c")
-    export(model, str(tmp_path / "new" / "walk.c"), "c")
-    export(model, tmp_path / "new" / "walk", "numpy")
+    export_policy(model, tmp_path, "c")
+    export_policy(model, str(tmp_path / "new" / "walk.c"), "c")
+    export_policy(model, tmp_path / "new" / "walk", "numpy")
     assert written(tmp_path) == ["new", "policy.c", "policy.h"]
     assert written(tmp_path / "new") == ["numpy_policy.py", "walk.c", "walk.h", "walk.npz"]
 
@@ -183,9 +183,9 @@ def broken(monkeypatch):
 def test_what_acts_otherwise_is_not_written_unless_forced(model, to, monkeypatch, tmp_path):
     broken(monkeypatch)
     with pytest.raises(ParityError, match="does not act as the model: .*difference .*allowed"):
-        export(model, tmp_path / "policy", to)
+        export_policy(model, tmp_path / "policy", to)
     assert written(tmp_path) == []
-    report = export(model, tmp_path / "policy", to, force=True)
+    report = export_policy(model, tmp_path / "policy", to, force=True)
     assert written(tmp_path)
     assert not report.parity.holds
     assert "note: written though it does not act as the model" in str(report)
@@ -195,7 +195,7 @@ def test_a_discrete_action_that_differs_is_told_with_the_gap_of_the_scores(monke
     broken(monkeypatch)
     model = make("PPO", "CartPole-v1")
     with pytest.raises(ParityError, match=r"actions differ for \d+ of 1000.*are .* apart in score"):
-        export(model, tmp_path / "policy")
+        export_policy(model, tmp_path / "policy")
 
 
 def test_parity_by_hand():
@@ -221,7 +221,7 @@ def test_rounding_may_grow_with_the_range_that_actions_are_squashed_into(tmp_pat
     wide = spaces.Box(np.float32([-1e6, -1]), np.float32([1e6, 1]))
     for algorithm in ("SAC", "TD3"):
         for to in ("c", "numpy", "onnx"):
-            report = export(make(algorithm, Task(VECTOR, wide)), tmp_path / "policy", to)
+            report = export_policy(make(algorithm, Task(VECTOR, wide)), tmp_path / "policy", to)
             assert report.parity.holds
     span = np.array([1e6, 1.0])
     for off, holds in (([5.0, 0], True), ([15.0, 0], False), ([0, 5e-6], True), ([0, 2e-5], False)):
@@ -235,9 +235,9 @@ def test_rounding_may_grow_with_the_range_that_actions_are_squashed_into(tmp_pat
 def test_without_a_compiler_a_c_file_is_written_only_when_forced(model, monkeypatch, tmp_path):
     monkeypatch.setenv("CC", "no-such-compiler")
     with pytest.raises(UnsupportedError, match="there is no no-such-compiler here; install gcc"):
-        export(model, tmp_path / "policy")
+        export_policy(model, tmp_path / "policy")
     assert written(tmp_path) == []
-    report = export(model, tmp_path / "policy", force=True)
+    report = export_policy(model, tmp_path / "policy", force=True)
     assert report.parity is None
     assert "parity: not checked" in str(report)
     assert "written unchecked, as asked" in str(report)
@@ -246,7 +246,7 @@ def test_without_a_compiler_a_c_file_is_written_only_when_forced(model, monkeypa
 
 def test_the_report_counts(tmp_path):
     model = make("SAC", policy_kwargs=dict(sparsity=0.9))
-    report = export(model, tmp_path / "policy", "c")
+    report = export_policy(model, tmp_path / "policy", "c")
     acting = ("actor.latent", "actor.mu")
     masks = [la.mask() for la in model.policy.sparse.layers if la.name.startswith(acting)]
     assert report.nnz == sum(int(mask.sum()) for mask in masks)
@@ -274,7 +274,7 @@ def test_recorded_images_are_channels_first(tmp_path):
     plain = DummyVecEnv([lambda: gym.make("TinyImages-v0")])
     found = record_observations(model, plain, 5)
     assert found.shape == (5, 1, 36, 36)
-    assert export(model, tmp_path / "policy", observations=found).parity.recorded == 5
+    assert export_policy(model, tmp_path / "policy", observations=found).parity.recorded == 5
 
 
 def test_a_model_that_saw_normalised_observations_needs_the_statistics(tmp_path):
@@ -285,25 +285,25 @@ def test_a_model_that_saw_normalised_observations_needs_the_statistics(tmp_path)
     trained.save(tmp_path / "model.zip")
     alone = type(trained).load(tmp_path / "model.zip")
     with pytest.raises(ConfigError, match="under a VecNormalize.*--vecnormalize FILE"):
-        export(alone, tmp_path / "policy")
-    report = export(alone, tmp_path / "policy", vecnormalize=tmp_path / "statistics.pkl")
+        export_policy(alone, tmp_path / "policy")
+    report = export_policy(alone, tmp_path / "policy", vecnormalize=tmp_path / "statistics.pkl")
     assert report.parity.holds
     plain = make("PPO")
     plain.learn(40)
-    assert export(plain, tmp_path / "plain").parity.holds
+    assert export_policy(plain, tmp_path / "plain").parity.holds
 
 
 def test_frames_that_are_stacked_after_normalisation(tmp_path):
     envs = VecFrameStack(VecNormalize(DummyVecEnv([lambda: gym.make("Pendulum-v1")])), 2)
     model = make("PPO", envs)
     with pytest.raises(ConfigError, match=r"shape \(3,\).*shape \(6,\).*'dense' only"):
-        export(model, tmp_path / "policy")
+        export_policy(model, tmp_path / "policy")
     seen = record_observations(model, envs, 20)
     assert seen.shape == (20, 6)
-    report = export(model, tmp_path / "policy", "dense", observations=seen)
+    report = export_policy(model, tmp_path / "policy", "dense", observations=seen)
     assert "does not normalise" in str(report)
     with pytest.raises(ConfigError, match="'dense' only"):
-        export(model, tmp_path / "policy", observations=seen)
+        export_policy(model, tmp_path / "policy", observations=seen)
 
 
 def test_an_environment_of_other_actions_is_refused(model):
@@ -315,7 +315,7 @@ def test_an_environment_of_other_actions_is_refused(model):
 def test_bounds_without_end_are_the_largest_floats_in_c(tmp_path):
     model = normalised(clip_obs=np.inf)
     for to in ("c", "numpy", "onnx"):
-        assert export(model, tmp_path / "policy", to).parity.holds
+        assert export_policy(model, tmp_path / "policy", to).parity.holds
     assert "3.4028235e+38f" in (tmp_path / "policy.c").read_text()
 
 
@@ -325,7 +325,7 @@ def test_batch_normalisation_of_observations_far_from_zero(tmp_path):
     norm.ra_mean.fill_(1000.0)
     norm.ra_var.fill_(0.3)
     for to in ("c", "numpy", "onnx"):
-        assert export(model, tmp_path / "policy", to).parity.difference < 1e-5
+        assert export_policy(model, tmp_path / "policy", to).parity.difference < 1e-5
 
 
 class Scaled(OwnExtractor):
@@ -365,7 +365,7 @@ def test_networks_that_would_be_misread_are_refused(extractor, shape, message, t
     env = Task(spaces.Box(-1, 1, shape, np.float32), spaces.Discrete(2))
     model = make("PPO", env, policy_kwargs=dict(features_extractor_class=extractor))
     with pytest.raises(UnsupportedError, match=message):
-        export(model, tmp_path / "policy")
+        export_policy(model, tmp_path / "policy")
 
 
 class OwnPolicy(ActorCriticPolicy):
@@ -377,30 +377,30 @@ class OwnSparsePolicy(SparseActorCriticPolicy):
 
 
 def test_dense_zips_keep_policy_classes_of_ones_own(tmp_path):
-    export(PPO(OwnPolicy, "CartPole-v1", device="cpu"), tmp_path / "own", "dense")
+    export_policy(PPO(OwnPolicy, "CartPole-v1", device="cpu"), tmp_path / "own", "dense")
     assert type(PPO.load(tmp_path / "own.zip").policy) is OwnPolicy
     model = PPO(OwnSparsePolicy, "CartPole-v1", device="cpu", policy_kwargs=dict(sparsity=0.5))
     with pytest.raises(UnsupportedError, match="OwnSparsePolicy is a sparse policy of your own"):
-        export(model, tmp_path / "sparse", "dense")
+        export_policy(model, tmp_path / "sparse", "dense")
 
 
 @pytest.mark.parametrize("tool", ["false", "cc -m32"])
 def test_a_compiler_that_is_no_use_is_named(model, tool, monkeypatch, tmp_path):
     monkeypatch.setenv("CC", tool)
     with pytest.raises(UnsupportedError, match="in CC, or write it unchecked"):
-        export(model, tmp_path / "policy")
+        export_policy(model, tmp_path / "policy")
     assert written(tmp_path) == []
 
 
 def test_all_files_are_written_or_none(model, tmp_path):
     (tmp_path / "policy.h").mkdir()
     with pytest.raises(ConfigError, match="policy.h is a folder"):
-        export(model, tmp_path / "policy.c")
+        export_policy(model, tmp_path / "policy.c")
     assert written(tmp_path) == ["policy.h"]
 
 
 def test_broken_sensors_are_not_hidden(model, tmp_path):
-    export(model, tmp_path / "policy", "c")
+    export_policy(model, tmp_path / "policy", "c")
     act = compiled((tmp_path / "policy.c").read_text(), graph_of(model, None))
     broken = np.full((1, 3), np.nan, np.float32)
     used = model.policy.actor.latent_pi[0].state_dict()["weight"].any()
@@ -410,4 +410,4 @@ def test_broken_sensors_are_not_hidden(model, tmp_path):
 
 def test_recorded_observations_that_are_not_finite_are_refused(model, tmp_path):
     with pytest.raises(ConfigError, match="must be finite"):
-        export(model, tmp_path / "policy", observations=np.full((2, 3), np.nan))
+        export_policy(model, tmp_path / "policy", observations=np.full((2, 3), np.nan))

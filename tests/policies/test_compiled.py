@@ -16,10 +16,10 @@ from sb3_sparse.analysis import (
     gradient_snr,
 )
 from sb3_sparse.analysis.networks import connections, parameters_by_network, specs_of
-from sb3_sparse.compress import compress
-from sb3_sparse.compress.state import fingerprint
+from sb3_sparse.compress import compress_model
+from sb3_sparse.compress.record import fingerprint
 from sb3_sparse.errors import CorruptStateError
-from sb3_sparse.export import FORMATS, export
+from sb3_sparse.export import FORMATS, export_policy
 from sb3_sparse.policies.compiled import plain_names, unwrapped
 from sb3_sparse.zoo.inspection import inspect_model
 from sb3_sparse.zoo.saved import algos_of
@@ -58,8 +58,8 @@ def test_a_compiled_policy_is_unwrapped_and_any_other_is_itself():
 def test_it_is_exported_as_before(algorithm, policy, tmp_path):
     plain, wrapped = compiled(algorithm, policy=policy)
     for to in FORMATS:
-        expected = export(plain, tmp_path / f"plain-{to}", to)
-        found = export(wrapped, tmp_path / f"wrapped-{to}", to)
+        expected = export_policy(plain, tmp_path / f"plain-{to}", to)
+        found = export_policy(wrapped, tmp_path / f"wrapped-{to}", to)
         assert found.parity.holds
         assert (found.nnz, found.units, found.notes) == (
             expected.nnz, expected.units, expected.notes
@@ -75,7 +75,7 @@ def test_a_part_that_is_compiled_is_exported_too(compute, tmp_path):
     actor = model.policy.actor
     actor.latent_pi = th.compile(actor.latent_pi, backend="eager")
     for to in FORMATS:
-        assert export(model, tmp_path / "policy", to).parity.holds
+        assert export_policy(model, tmp_path / "policy", to).parity.holds
 
 
 @pytest.mark.parametrize("compute", ["masked", "sparse"])
@@ -151,7 +151,7 @@ def test_it_is_analysed_as_before(algorithm, policy):
 def test_it_is_compressed(tmp_path):
     _, model = compiled("PPO", env="CartPole-v1", policy="MlpPolicy")
     envs = DummyVecEnv([lambda: gym.make("CartPole-v1")])
-    outcome = compress(model, envs, tmp_path / "out", sparsity=0.5, steps=64, episodes=2)
+    outcome = compress_model(model, envs, tmp_path / "out", sparsity=0.5, steps=64, episodes=2)
     assert outcome.sparsity["actor"] == pytest.approx(0.5, abs=0.01)
     assert type(model).load(outcome.path).policy.sparsity_report().sparsity("actor") > 0.49
 

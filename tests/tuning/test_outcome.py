@@ -15,7 +15,7 @@ import yaml
 from rich.console import Console
 from tuning_support import choices, small_run
 
-from sb3_sparse.cli.tuneprogress import TuningProgress
+from sb3_sparse.cli.progress.tune import TuningProgress
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.tuning import tune, write_report
 from sb3_sparse.tuning.backend import TrialState, optuna

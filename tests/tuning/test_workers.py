@@ -16,7 +16,7 @@ import pytest
 from tuning_support import choices, small_run
 
 from sb3_sparse.errors import ConfigError, TuningFailed
-from sb3_sparse.launch import Ended, Launcher
+from sb3_sparse.launch import Launcher, TaskResult
 from sb3_sparse.tuning import Space, tune
 from sb3_sparse.tuning.backend import TrialState, optuna
 from sb3_sparse.tuning.queue import QueueEmpty
@@ -188,9 +188,9 @@ class Here(Launcher):
     def run(self, tasks, workers):
         for task in tasks:
             try:
-                yield Ended(task, value=task())
+                yield TaskResult(task, value=task())
             except Exception as error:
-                yield Ended(task, error=f"Traceback:\n{error}")
+                yield TaskResult(task, error=f"Traceback:\n{error}")
 
 
 @pytest.mark.parametrize("trials", [2, 5])  # a worker gives up after three
@@ -207,7 +207,7 @@ def test_a_study_in_which_every_trial_fails_is_an_error_with_the_first_reason(tr
 def test_workers_that_come_to_no_trial_are_an_error_too(tmp_path):
     class Dead(Launcher):
         def run(self, tasks, workers):
-            yield Ended(tasks[0], error="its process was killed\nby SIGKILL")
+            yield TaskResult(tasks[0], error="its process was killed\nby SIGKILL")
 
     with pytest.raises(TuningFailed, match="every worker .* failed, first worker 1: by SIGKILL"):
         tune(small_run(), choices(**GRID), log_folder=tmp_path, launcher=Dead())

@@ -13,9 +13,9 @@ import pytest
 import yaml
 
 from sb3_sparse.cli.common import values_and_packages
-from sb3_sparse.compress import compress
+from sb3_sparse.compress import compress_model
 from sb3_sparse.errors import ConfigError
-from sb3_sparse.export import export
+from sb3_sparse.export import export_policy
 from sb3_sparse.launch import launcher_named
 from sb3_sparse.report import write_report
 from sb3_sparse.studies import Study, run_study, status_of
@@ -117,11 +117,13 @@ def test_a_run_is_watched_exported_and_made_sparser_by_its_folder_alone(trained,
     forget()
     saved = find_saved(trained)
     envs = evaluation_envs(saved, 1, 0)
-    export(saved.load(), tmp_path / "policy", "numpy")
+    export_policy(saved.load(), tmp_path / "policy", "numpy")
     assert (tmp_path / "policy.npz").is_file()
     forget()
     training = training_envs(saved, 1, 0)
-    compress(saved.load(training), envs, tmp_path / "out", sparsity=0.95, steps=100, episodes=2)
+    compress_model(
+        saved.load(training), envs, tmp_path / "out", sparsity=0.95, steps=100, episodes=2
+    )
     write_run_files(saved, tmp_path / "out")
     assert arguments_of(tmp_path / "out")["gym_packages"] == ["tiny_envs"]
 

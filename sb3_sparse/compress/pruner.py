@@ -30,7 +30,7 @@ WHEREABOUTS = ("_last_obs", "_last_original_obs", "_last_episode_starts")
 """Where a model is in its environment."""
 
 
-class Bench:
+class ModelPruner:
     """Prunes, trains and evaluates for a search.
 
     :param model: the model to be compressed, with an environment; it is not changed, but its

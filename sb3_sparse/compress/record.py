@@ -24,7 +24,7 @@ FORMAT = 1
 
 
 @dataclass
-class State:
+class CompressionRecord:
     """All that an interrupted compression goes on from, beside the accepted model.
 
     :param settings: what decides about the outcome, in plain JSON types
@@ -51,34 +51,34 @@ class State:
             new.write_text(json.dumps({"format": FORMAT, **asdict(self)}, indent=1) + "\n")
 
 
-def open_state(folder: Path, settings: dict[str, Any]) -> State:
-    """The state in a folder, or a new one.
+def open_record(folder: Path, settings: dict[str, Any]) -> CompressionRecord:
+    """The record in a folder, or a new one.
 
     :raises ConfigError: if the folder's compression is of other settings
     :raises CorruptStateError: if its file is damaged
     """
     path = folder / NAME
     if not path.is_file():
-        return State(settings)
+        return CompressionRecord(settings)
     cure = "remove the folder and begin anew"
     content = read_json(path, "record of a compression", cure)
     with reading(path, "record of a compression", cure):
-        state = State(
+        record = CompressionRecord(
             settings=content["settings"],
             baseline={int(batch): found for batch, found in content["baseline"].items()},
             levels=[_level(level) for level in content["levels"]],
             checked=content["checked"],
             finished=content["finished"],
         )
-        if not isinstance(state.settings, dict):
+        if not isinstance(record.settings, dict):
             raise CorruptStateError(f"{path} is damaged: settings are no mapping; {cure}")
     others = {
-        name: (state.settings.get(name), settings.get(name))
-        for name in {**state.settings, **settings}
-        if state.settings.get(name) != settings.get(name)
+        name: (record.settings.get(name), settings.get(name))
+        for name in {**record.settings, **settings}
+        if record.settings.get(name) != settings.get(name)
     }
-    if others and not state.levels:
-        return State(settings)  # nothing is lost but a first look
+    if others and not record.levels:
+        return CompressionRecord(settings)  # nothing is lost but a first look
     if others:
         told = ", ".join(
             f"{name} {old!r} instead of {new!r}" for name, (old, new) in others.items()
@@ -87,7 +87,7 @@ def open_state(folder: Path, settings: dict[str, Any]) -> State:
             f"{folder} holds a compression with {told}. Give the same settings to go on with it, "
             "or another folder"
         )
-    return state
+    return record
 
 
 def _level(content: Mapping[str, Any]) -> Level:

@@ -1,0 +1,1 @@
+"""What a user sees while a command works: bars on a terminal, lines elsewhere."""
