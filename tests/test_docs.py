@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import doctest
+import inspect
 import re
 import shlex
 import subprocess
 import sys
+import textwrap
+from importlib import import_module
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +30,101 @@ from sb3_sparse.zoo.spec import RunSpec
 from sb3_sparse.zoo.training import train
 
 ROOT = Path(__file__).parent.parent
+DOORS = ["", ".analysis", ".compress", ".export", ".report", ".sparsity", ".studies"]
+DOORS += [".topology", ".tuning", ".zoo"]
+WITHOUT_EXAMPLE = {
+    "sb3_sparse.A2C",
+    "sb3_sparse.BaseSparsePolicy",
+    "sb3_sparse.DDPG",
+    "sb3_sparse.DQN",
+    "sb3_sparse.NetworkSpec",
+    "sb3_sparse.PPO",
+    "sb3_sparse.PassCounts",
+    "sb3_sparse.SAC",
+    "sb3_sparse.SparseActorCriticPolicy",
+    "sb3_sparse.SparseCrossQPolicy",
+    "sb3_sparse.SparseDQNPolicy",
+    "sb3_sparse.SparseQRDQNPolicy",
+    "sb3_sparse.SparseSACPolicy",
+    "sb3_sparse.SparseTD3Policy",
+    "sb3_sparse.SparseTQCPolicy",
+    "sb3_sparse.SparsityCallback",
+    "sb3_sparse.TD3",
+    "sb3_sparse.analysis.DormantShare",
+    "sb3_sparse.analysis.FlopsReport",
+    "sb3_sparse.analysis.GradientSNR",
+    "sb3_sparse.analysis.GradientSNRCallback",
+    "sb3_sparse.analysis.LayerFlops",
+    "sb3_sparse.analysis.NetworkSNR",
+    "sb3_sparse.analysis.NoiseRobustness",
+    "sb3_sparse.analysis.PlasticityCallback",
+    "sb3_sparse.compress.Compression",
+    "sb3_sparse.export.ExportReport",
+    "sb3_sparse.export.Parity",
+    "sb3_sparse.report.LeftOut",
+    "sb3_sparse.report.Results",
+    "sb3_sparse.report.RunData",
+    "sb3_sparse.report.Verdict",
+    "sb3_sparse.studies.CellStatus",
+    "sb3_sparse.studies.Progress",
+    "sb3_sparse.studies.Study",
+    "sb3_sparse.topology.DropGrow",
+    "sb3_sparse.topology.Exchange",
+    "sb3_sparse.topology.Layer",
+    "sb3_sparse.topology.MaskUpdate",
+    "sb3_sparse.topology.TopologyMethod",
+    "sb3_sparse.tuning.Objective",
+    "sb3_sparse.tuning.Space",
+    "sb3_sparse.tuning.Tuned",
+}
+"""Public classes whose docstring has no example yet."""
+
+
+def public_classes() -> dict[str, type]:
+    """Every class that a package of :data:`DOORS` exports, by the name that users import."""
+    found: dict[type, str] = {}
+    for door in DOORS:
+        module = import_module(f"sb3_sparse{door}")
+        for name in getattr(module, "__all__", ()):
+            one = getattr(module, name)
+            if isinstance(one, type) and not issubclass(one, Exception):
+                found.setdefault(one, f"sb3_sparse{door}.{name}")
+    return {name: one for one, name in found.items()}
+
+
+PUBLIC = public_classes()
+
+
+def example_of(cls: type) -> str:
+    """The block below ``Example::`` in a docstring, or what its ``>>>`` lines say; "" if none."""
+    text = inspect.cleandoc(cls.__dict__.get("__doc__") or "")
+    _, _, block = text.partition("Example::\n")
+    code = list(takewhile(is_of_block, block.splitlines()))
+    return textwrap.dedent("\n".join(code)).strip() if code else ">>>" * (">>>" in text)
+
+
+def is_of_block(line: str) -> bool:
+    return not line or line.startswith(" ")
+
+
+def test_every_public_class_has_an_example():
+    without = {name for name, cls in PUBLIC.items() if not example_of(cls)}
+    assert without == WITHOUT_EXAMPLE
+
+
+@pytest.mark.parametrize("name", sorted(PUBLIC.keys() - WITHOUT_EXAMPLE))
+def test_the_example_of_a_public_class_runs(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    cls = PUBLIC[name]
+    code = example_of(cls)
+    if code != ">>>":
+        exec(compile(code, name, "exec"), {"__name__": "example"})
+        return
+    text = inspect.cleandoc(cls.__doc__ or "")
+    found = doctest.DocTestParser().get_doctest(text, {}, name, None, None)
+    said: list[str] = []
+    doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(found, out=said.append)
+    assert not said, "".join(said)
 
 
 def python_blocks(path: str) -> list[str]:
