@@ -21,7 +21,7 @@ FLOORS = [
     {"engine"},
     {"topology"},
     {"sparsity"},
-    {"files", "pages"},
+    {"files", "intervals", "pages"},
     {"errors", "lazy"},
 ]
 HEIGHT = {part: -level for level, parts in enumerate(FLOORS) for part in parts}
@@ -43,7 +43,7 @@ EDGES = {
     "rliable": {"report"},
     "onnx": {"export"},
     "onnxruntime": {"export"},
-    "scipy": {"compress", "export", "report"},
+    "scipy": {"export", "intervals"},
     "ray": {"launch"},
     "sqlalchemy": {"tuning"},
     "plotly": {"tuning"},

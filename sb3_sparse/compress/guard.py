@@ -8,9 +8,8 @@ from typing import Literal
 
 import numpy as np
 
-from sb3_sparse.errors import ConfigError, MissingExtra
-
-CONFIDENCE = 0.95
+from sb3_sparse import intervals
+from sb3_sparse.errors import ConfigError
 
 
 @dataclass(frozen=True)
@@ -42,12 +41,8 @@ def mean_interval(values: Sequence[float]) -> Interval:
 
     :param values: two or more
     """
-    array = np.asarray(values, dtype=np.float64)
-    assert array.size >= 2
-    mean = float(array.mean())
-    error = float(array.std(ddof=1)) / np.sqrt(array.size)
-    half = _t_quantile(array.size - 1) * error
-    return Interval(mean, float(mean - half), float(mean + half))
+    assert len(values) >= 2
+    return Interval(*map(float, intervals.mean_interval(values)))
 
 
 def change(sparse: Sequence[float], baseline: Sequence[float]) -> Interval:
@@ -90,11 +85,3 @@ def tolerance(baseline: Sequence[float], max_drop: float) -> float:
             "instead of a largest drop, or evaluate more episodes"
         )
     return max_drop * abs(interval.mean)
-
-
-def _t_quantile(freedom: int) -> float:
-    try:
-        from scipy.special import stdtrit
-    except ImportError as error:
-        raise MissingExtra("compressing a model", "zoo") from error
-    return float(stdtrit(freedom, 0.5 + CONFIDENCE / 2))

@@ -1,4 +1,4 @@
-"""The one door to rliable, scipy and matplotlib."""
+"""The one door to rliable and matplotlib."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ try:
         PercentFormatter,
     )
     from rliable import library as rliable_library
-    from scipy.stats import t as student_t
 except ImportError as error:
     raise MissingExtra("reports on runs", "report") from error
 
@@ -30,5 +29,4 @@ __all__ = [
     "PercentFormatter",
     "matplotlib",
     "rliable_library",
-    "student_t",
 ]

@@ -26,8 +26,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sb3_sparse.report.backend import rliable_library, student_t
-from sb3_sparse.report.data import Array
+from sb3_sparse.intervals import Array, mean_interval, t_quantile
+from sb3_sparse.report.backend import rliable_library
 
 REPS, SEED, LEAST = 2000, 0, 2
 NORMAL_975 = 1.959963984540054
@@ -153,7 +153,7 @@ def difference(
     plain = _bootstrap((x, y), subtract, reps)
     freedom = x.shape[1] * (len(x) + len(y) - 2)
     least = min(len(x), len(y))
-    factor = np.sqrt(least / (least - 1)) * student_t.ppf(0.975, freedom) / NORMAL_975
+    factor = np.sqrt(least / (least - 1)) * t_quantile(freedom) / NORMAL_975
     low = plain.value - factor * (plain.value - plain.low)
     high = plain.value + factor * (plain.high - plain.value)
     return Estimate(plain.value, float(low), float(high), least, x.shape[1])
@@ -161,23 +161,8 @@ def difference(
 
 def mean(values: Sequence[float]) -> Estimate:
     """Mean over seeds with Student's t interval, which is right for few seeds; none for one."""
-    found, low, high = means(np.asarray(values, dtype=np.float64)[:, None])
-    return Estimate(float(found[0]), float(low[0]), float(high[0]), len(values))
-
-
-def means(values: Array) -> tuple[Array, Array, Array]:
-    """Mean over the first axis and the ends of its interval, pointwise.
-
-    :param values: shape ``[seeds, points]``
-    :return: each of shape ``[points]``; the ends are nan for one seed
-    """
-    count = len(values)
-    middle = values.mean(axis=0)
-    if count < LEAST:
-        nothing = np.full_like(middle, np.nan)
-        return middle, nothing, nothing
-    half = student_t.ppf(0.975, count - 1) * values.std(axis=0, ddof=1) / np.sqrt(count)
-    return middle, middle - half, middle + half
+    middle, low, high = map(float, mean_interval(values))
+    return Estimate(middle, low, high, len(values))
 
 
 def means_at(
@@ -186,10 +171,10 @@ def means_at(
     """The same of curves, at the points that all of them have.
 
     :param seeds: value by point, a curve a seed
-    :return: the points in order, and what :func:`means` gives there
+    :return: the points in order, and the mean there with the ends of its interval
     """
     points = sorted(set.intersection(*(set(curve) for curve in seeds)))
-    return points, means(np.array([[curve[x] for x in points] for curve in seeds]))
+    return points, mean_interval(np.array([[curve[x] for x in points] for curve in seeds]))
 
 
 def _shares(scores: Array, taus: Array) -> Array:

@@ -5,13 +5,13 @@ import pytest
 import scipy.stats
 from rliable import metrics
 
+from sb3_sparse.intervals import mean_interval
 from sb3_sparse.report.statistics import (
     difference,
     improvement,
     iqm,
     iqm_estimates,
     mean,
-    means,
     profile,
     rectangle,
 )
@@ -111,7 +111,7 @@ def test_means_have_students_interval_and_one_seed_has_none():
     expected = scipy.stats.ttest_1samp(values, 0.0).confidence_interval(0.95)
     estimate = mean(values)
     assert (estimate.low, estimate.high) == pytest.approx((expected.low, expected.high))
-    middle, low, _ = means(np.array([[1.0, 2.0]]))
+    middle, low, _ = mean_interval(np.array([[1.0, 2.0]]))
     assert middle.tolist() == [1.0, 2.0]
     assert np.isnan(low).all()
 

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from sb3_sparse.intervals import mean_interval
 from sb3_sparse.report.data import Array, RunData
 from sb3_sparse.report.figures.base import Drawing, figure, legend, line, panels
 from sb3_sparse.report.methods import DENSE, look_of, name_of, percent
 from sb3_sparse.report.results import NotEnoughData, Results
-from sb3_sparse.report.statistics import means
 
 HEADS = ("family", "environment", "sparsity", "method", "timesteps", "mean", "low", "high", "seeds")
 
@@ -48,7 +48,7 @@ def draw(results: Results) -> Drawing:
                 continue
             steps, values, said = aligned(runs)
             remarks += said
-            ends = means(values)
+            ends = mean_interval(values)
             line(one, steps.tolist(), ends, look_of(label), name_of(label))
             shown = 0.0 if label == DENSE else level
             for step, *three in zip(steps, *ends, strict=True):
