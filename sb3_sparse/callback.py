@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import inspect
+
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_sparse.engine.plan import Plan
@@ -9,8 +11,6 @@ from sb3_sparse.errors import ConfigError, warn
 from sb3_sparse.policies.base import BaseSparsePolicy
 from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.topology import method_named
-
-DEFAULTS = {"update_interval": 1000, "drop_fraction": 0.5, "end": 0.8, "update_on": "step"}
 
 
 class SparsityCallback(BaseCallback):
@@ -26,14 +26,13 @@ class SparsityCallback(BaseCallback):
 
     :param method: ``"static"``, ``"set"``, ``"rigl"``, ``"prune"`` or a registered one
     :param update_interval: gradient steps of a network's own optimizer between two updates
-        (default 1000)
     :param drop_fraction: share of a layer's connections exchanged at the first update; decays to 0
-        along a cosine (default 0.5)
-    :param begin: progress (environment steps done / planned) at which updates begin (default 0, 0.2
-        for ``"prune"``)
-    :param end: progress at which they end (default 0.8)
-    :param update_on: ``"step"``: at the gradient step that is due (default); ``"rollout"``: at the
-        start of the next rollout
+        along a cosine
+    :param begin: progress (environment steps done / planned) at which updates begin; None: as the
+        method has it, which is 0.2 for ``"prune"`` and 0 for the others
+    :param end: progress at which they end
+    :param update_on: ``"step"``: at the gradient step that is due; ``"rollout"``: at the start of
+        the next rollout
     :param verbose: as in SB3
     :raises ConfigError: for an unknown method, a value that is not allowed or an argument that
         means nothing for the method
@@ -45,11 +44,11 @@ class SparsityCallback(BaseCallback):
         self,
         method: str,
         *,
-        update_interval: int | None = None,
-        drop_fraction: float | None = None,
+        update_interval: int = 1000,
+        drop_fraction: float = 0.5,
         begin: float | None = None,
-        end: float | None = None,
-        update_on: str | None = None,
+        end: float = 0.8,
+        update_on: str = "step",
         verbose: int = 0,
     ) -> None:
         super().__init__(verbose)
@@ -61,14 +60,16 @@ class SparsityCallback(BaseCallback):
             "end": end,
             "update_on": update_on,
         }
-        given = {name: value for name, value in given.items() if value is not None}
-        unused = sorted(given.keys() - topology.options)
+        usual = inspect.signature(SparsityCallback).parameters
+        changed = {name for name, value in given.items() if value != usual[name].default}
+        unused = sorted(changed - topology.options)
         if unused:
             raise ConfigError(
                 f"method {method!r} has no {', '.join(unused)}; it takes "
                 f"{', '.join(sorted(topology.options)) or 'no options'}"
             )
-        self.plan = Plan(method, **{**DEFAULTS, "begin": topology.default_begin, **given})  # type: ignore[arg-type]
+        begins = topology.default_begin if begin is None else begin
+        self.plan = Plan(method, update_interval, drop_fraction, begins, end, update_on)
 
     def _sparse_policy(self) -> BaseSparsePolicy:
         policy = unwrapped(self.model.policy)
@@ -111,6 +112,8 @@ class SparsityCallback(BaseCallback):
             in_force=lambda: model.start_time == began,
         )
         self._note_progress()
+        self._began = sparse.progress
+        self._clocks = {network.name: network.clock for network in sparse.networks}
 
     def _on_rollout_start(self) -> None:
         self._sparse_policy().sparse.flush()
@@ -133,15 +136,15 @@ class SparsityCallback(BaseCallback):
 
     def _warn_if_nothing_was_due(self) -> None:
         sparse = self._sparse_policy().sparse
-        never_moved = not any(network.mask_updates for network in sparse.networks)
-        if self.plan.topology.options and sparse.updates_due == 0 and never_moved:
+        reachable = self._began < self.plan.end
+        if self.plan.topology.options and sparse.updates_due == 0 and reachable:
+            steps = (f"{n.name}: {n.clock - self._clocks[n.name]} steps" for n in sparse.networks)
             warn(
                 f"{self.plan.method!r} had no mask update, so this was static training. An update "
                 f"is due at every {self.plan.update_interval}th gradient step of a network between "
                 f"{self.plan.begin:.0%} and {self.plan.end:.0%} of training, and none fell there ("
-                + ", ".join(f"{n.name}: {n.clock} steps in all" for n in sparse.networks)
-                + "); train longer, choose a smaller update_interval or, where gradient steps "
-                "begin late, a smaller learning_starts"
+                f"{', '.join(steps)}); train longer, choose a smaller update_interval or, where "
+                "gradient steps begin late, a smaller learning_starts"
             )
 
     def _note_progress(self) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import inspect
 from contextlib import nullcontext
 
 import numpy as np
@@ -277,6 +278,29 @@ def test_training_too_short_for_an_update_says_so():
         make("SAC").learn(40, callback=SparsityCallback("set"))
 
 
+def test_a_second_training_without_an_update_says_so_too():
+    model = make("SAC").learn(40, callback=SparsityCallback("set", update_interval=2))
+    assert model.policy.sparse.networks[0].mask_updates > 0
+    with pytest.warns(UserWarning, match="no mask update.*actor: 20 steps"):
+        model.learn(40, callback=SparsityCallback("set"))
+
+
+def test_training_on_after_the_last_update_says_nothing(recwarn):
+    model = make("SAC").learn(40, callback=SparsityCallback("set", update_interval=2))
+    model.learn(5, callback=SparsityCallback("set"), reset_num_timesteps=False)
+    assert not recwarn.list
+
+
+def test_help_shows_the_defaults_and_a_method_leaves_alone_what_it_does_not_take():
+    shown = str(inspect.signature(SparsityCallback))
+    for default in ("update_interval: 'int' = 1000", "drop_fraction: 'float' = 0.5", "= 0.8"):
+        assert default in shown
+    assert '0.2 for ``"prune"``' in (SparsityCallback.__doc__ or "")
+    assert SparsityCallback("prune").plan.begin == 0.2
+    assert SparsityCallback("rigl").plan.begin == 0.0
+    assert SparsityCallback("prune", begin=0.0).plan.begin == 0.0
+
+
 def test_learning_for_no_steps_is_allowed_as_in_sb3():
     make("PPO").learn(0, callback=SparsityCallback("static"))
 
@@ -299,7 +323,7 @@ def test_a_child_of_an_event_callback_moves_masks_too():
             dict(update_interval=10),
             "'static' has no update_interval; it takes no options",
         ),
-        ("prune", dict(drop_fraction=0.5), "'prune' has no drop_fraction; it takes begin, end"),
+        ("prune", dict(drop_fraction=0.3), "'prune' has no drop_fraction; it takes begin, end"),
         ("set", dict(drop_fraction=2.0), "drop_fraction must lie in"),
         ("rigl", dict(update_on="episode"), "one of step, rollout"),
     ],

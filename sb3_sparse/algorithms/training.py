@@ -22,11 +22,13 @@ from sb3_sparse.engine.changes import ChangeDetector, patched
 from sb3_sparse.engine.linear import SparseLinear
 from sb3_sparse.engine.native.library import why_missing
 from sb3_sparse.engine.paths import parts_of
+from sb3_sparse.errors import UnsupportedError
 from sb3_sparse.fused.errors import NotCovered
 from sb3_sparse.fused.machine import Machine
 from sb3_sparse.fused.program import Parts, Program
 from sb3_sparse.policies.base import BaseSparsePolicy
 from sb3_sparse.policies.compiled import unwrapped
+from sb3_sparse.policies.registry import registered, writers_of
 from sb3_sparse.policies.shortcut import only_flattens, takes_vectors, untouched
 from sb3_sparse.policies.storage import KNOWN
 
@@ -223,9 +225,25 @@ class Fused(BaseAlgorithm):
     _training: Training
 
     def _setup_model(self) -> None:
+        self._check_policy_class()
         super()._setup_model()  # type: ignore[safe-super]
         if isinstance(self.policy, BaseSparsePolicy):
             self.policy.use_kernels()  # also where it has no zeros, and so would stay stock SB3's
+
+    def _check_policy_class(self) -> None:
+        """Reject policies of other algorithms, of a file that another one saved, say.
+
+        :raises UnsupportedError: for a policy class that is known to be of another algorithm
+        """
+        policy, known = self.policy_class, registered().values()
+        own = [one.stock_policy for one in known if isinstance(self, one.algorithm)]
+        others = writers_of(policy)
+        if others and not issubclass(policy, tuple(own)):
+            name = type(self).__name__
+            raise UnsupportedError(
+                f"{policy.__name__} is a policy of {' or '.join(others)}, not of {name}; make or "
+                f"load the model with {others[0]}"
+            )
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_training"]

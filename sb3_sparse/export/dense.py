@@ -76,7 +76,7 @@ def _stock_class(policy: type[BasePolicy]) -> type[BasePolicy]:
 
 def _stock_kwargs(policy: BasePolicy, kwargs: dict[str, Any]) -> dict[str, Any]:
     """Policy arguments without those of sparse policies, the classes among them imported."""
-    sparse = {*SparsityConfig.__dataclass_fields__, "weight_decay"}
+    sparse = SparsityConfig.__dataclass_fields__
     stock = {name: value for name, value in kwargs.items() if name not in sparse}
     import_named(stock)
     if isinstance(policy, BaseSparsePolicy):  # which may have another by default

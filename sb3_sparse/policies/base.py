@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
+import inspect
+from collections.abc import Mapping
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -21,7 +22,7 @@ from sb3_sparse.errors import CorruptStateError, UnsupportedError
 from sb3_sparse.policies.acting import Acts
 from sb3_sparse.policies.build import build_networks
 from sb3_sparse.policies.compiled import names_in, plain_names
-from sb3_sparse.policies.config import SparsityConfig
+from sb3_sparse.policies.config import SparsityConfig, check_arguments
 from sb3_sparse.policies.extractors import choose_extractor, copied_modules
 from sb3_sparse.policies.named import import_named
 from sb3_sparse.policies.parts import WHOLE_POLICY, without_graphs
@@ -40,22 +41,10 @@ class BaseSparsePolicy(Acts):
     :param observation_space: as in SB3
     :param action_space: as in SB3
     :param lr_schedule: as in SB3
-    :param sparsity: removed fraction of the weights, in [0, 1), or one for each
-        network, e.g. ``{"actor": 0.95, "critic": 0.8}``; required
-    :param initial_sparsity: what training starts with; None: the same; 0.0 for pruning
-    :param distribution: ``"erk"``, ``"er"`` or ``"uniform"``
-    :param actor_share: fraction of all remaining connections that the actor gets; None: equally
-        sparse
-    :param dense_layers: layers left dense, by name pattern or the words ``"input"``, ``"output"``
-    :param sparsity_aware_init: draw the weights by the fans that are there
-    :param weight_decay: coupled L2 on weights only
-    :param mask_seed: seed of masks and growth; None: read off torch's generator without advancing
-        it, so that SB3's ``seed`` decides
-    :param compute: ``"masked"``: dense weights and masks; ``"sparse"``: linear layers store and
-        compute their active connections only; ``"auto"``: large and sparse ones do, by a rule of
-        shapes and counts (docs/compute.md)
-    :param kwargs: SB3's own policy arguments; ``features_extractor_class``, ``optimizer_class`` and
-        ``activation_fn`` may also be dotted paths, e.g. ``"torch.nn.ReLU"``
+    :param kwargs: fields of :class:`~sb3_sparse.policies.config.SparsityConfig`, of which
+        ``sparsity`` is required, and SB3's own policy arguments; ``features_extractor_class``,
+        ``optimizer_class`` and ``activation_fn`` may also be dotted paths, e.g.
+        ``"torch.nn.ReLU"``
     :raises ConfigError: for a value that is not allowed
     :raises UnsupportedError: for layers or observations that cannot be trained sparsely
     :raises MissingKernels: for ``compute="sparse"`` without compiled kernels
@@ -88,16 +77,6 @@ class BaseSparsePolicy(Acts):
         observation_space: spaces.Space[Any],
         action_space: spaces.Space[Any],
         lr_schedule: Schedule | None = None,
-        *,
-        sparsity: float | Mapping[str, float] | None = None,
-        initial_sparsity: float | None = None,
-        distribution: str = "erk",
-        actor_share: float | None = None,
-        dense_layers: Sequence[str] = (),
-        sparsity_aware_init: bool = True,
-        weight_decay: float = 0.0,
-        mask_seed: int | None = None,
-        compute: str = "auto",
         **kwargs: Any,
     ) -> None:
         if lr_schedule is None:
@@ -106,18 +85,10 @@ class BaseSparsePolicy(Acts):
                 "algorithm that learns without gradients, such as ARS, which has no sparse policy. "
                 "sb3_sparse.supported_algorithms() lists those that have one"
             )
-        config = SparsityConfig(
-            sparsity=sparsity,
-            initial_sparsity=initial_sparsity,
-            distribution=distribution,
-            actor_share=actor_share,
-            dense_layers=dense_layers,
-            sparsity_aware_init=sparsity_aware_init,
-            mask_seed=mask_seed,
-            compute=compute,
-        )
+        check_arguments(type(self), kwargs)
+        config = SparsityConfig.pop_from(kwargs)
         import_named(kwargs)
-        weight_decay = check_weight_decay(weight_decay, kwargs.get("optimizer_kwargs"))
+        weight_decay = check_weight_decay(config.weight_decay, kwargs.get("optimizer_kwargs"))
         if "features_extractor_class" not in kwargs:
             kwargs["features_extractor_class"] = self.extractor_class or choose_extractor(
                 observation_space, kwargs.get("normalize_images", True)
@@ -125,21 +96,21 @@ class BaseSparsePolicy(Acts):
         drawn_seed = peek_seed()
         super().__init__(observation_space, action_space, lr_schedule, **kwargs)
         self.sparsity_config = config
-        seed = drawn_seed if mask_seed is None else mask_seed
+        seed = drawn_seed if config.mask_seed is None else config.mask_seed
         networks = build_networks(self, self.networks, config, seed, self._initial_gain)
         for network in networks:
             prefer_fused(network.optimizer)
         layers = [layer for network in networks for layer in network.layers]
-        allowed = may_be_sparse(self, layers, asked_for=compute == "sparse")
+        allowed = may_be_sparse(self, layers, asked_for=config.compute == "sparse")
         self.sparse = Controller(
             networks,
             seed,
             self.functional_gradients,
             weight_decay,
-            AutoCompute(allowed) if compute == "auto" else None,
+            AutoCompute(allowed) if config.compute == "auto" else None,
         )
         self.sparse.choose_storage(self)
-        if compute == "sparse":
+        if config.compute == "sparse":
             self.sparse.to_sparse(self, allowed)
         if not all(layer.full and layer.final_nnz == layer.size for layer in self.sparse.layers):
             self.use_kernels()  # a policy without zeros stays stock SB3's to the bit
@@ -280,17 +251,22 @@ class BaseSparsePolicy(Acts):
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
         config = self.sparsity_config
-        data.update(
-            sparsity=config.sparsity,
-            initial_sparsity=config.initial_sparsity,
-            distribution=config.distribution,
-            actor_share=config.actor_share,
-            dense_layers=list(config.dense_layers),
-            sparsity_aware_init=config.sparsity_aware_init,
-            mask_seed=config.mask_seed,
-            compute=config.compute,
-            weight_decay=self.sparse.weight_decay,
-        )
+        data.update(vars(config), dense_layers=list(config.dense_layers))
+        data["weight_decay"] = self.sparse.weight_decay
         if hasattr(self, "share_features_extractor"):  # SB3 forgets it for some of its policies
             data["share_features_extractor"] = self.share_features_extractor
         return data
+
+
+def _with_sparse_arguments(own: inspect.Signature) -> inspect.Signature:
+    """What ``help()`` shows: the fields of the config by name, before ``**kwargs``."""
+    *first, kwargs = own.parameters.values()
+    sparse = [
+        one.replace(kind=one.KEYWORD_ONLY)
+        for one in inspect.signature(SparsityConfig).parameters.values()
+    ]
+    return own.replace(parameters=[*first, *sparse, kwargs])
+
+
+_init: Any = BaseSparsePolicy.__init__
+_init.__signature__ = _with_sparse_arguments(inspect.signature(_init))

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+import inspect
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from functools import cache
+from typing import Any
 
 import numpy as np
 
 from sb3_sparse.engine.native.library import library
-from sb3_sparse.errors import ConfigError
+from sb3_sparse.errors import ConfigError, did_you_mean
 from sb3_sparse.sparsity.budgets import split_sparsity
 from sb3_sparse.sparsity.distributions import check_distribution, check_sparsity
 from sb3_sparse.sparsity.numeric import is_whole
@@ -36,6 +39,7 @@ class SparsityConfig:
         (``"actor.mu"``, ``"critic.qf*.4"``) or by the words ``"input"`` and ``"output"``
     :param sparsity_aware_init: draw the weights by the fans that are there (a network that starts
         dense keeps SB3's own)
+    :param weight_decay: coupled L2 on weights only
     :param mask_seed: seed of masks and growth; None: read off torch's generator without advancing
         it, so that SB3's ``seed`` decides
     :param compute: ``"masked"``: dense weights and masks; ``"sparse"``: linear layers store and
@@ -50,6 +54,7 @@ class SparsityConfig:
     actor_share: float | None = None
     dense_layers: Sequence[str] = ()
     sparsity_aware_init: bool = True
+    weight_decay: float = 0.0
     mask_seed: int | None = None
     compute: str = "auto"
 
@@ -91,6 +96,12 @@ class SparsityConfig:
         if self.compute == "sparse":
             library()
 
+    @classmethod
+    def pop_from(cls, kwargs: dict[str, Any]) -> SparsityConfig:
+        """The config that keyword arguments of a policy say, which are removed from them."""
+        names = [one.name for one in fields(cls) if one.name in kwargs]
+        return cls(**{"sparsity": None, **{name: kwargs.pop(name) for name in names}})
+
     def by_network(self, sizes: Mapping[str, int]) -> dict[str, float]:
         """The sparsity of each network.
 
@@ -129,3 +140,35 @@ class SparsityConfig:
                 f"{network!r}; pruning only removes, so start at or below it (0.0 is dense)"
             )
         return check_sparsity(self.initial_sparsity)
+
+
+@cache
+def arguments_of(cls: type) -> frozenset[str]:
+    """Names that a class takes when made, but those that every SB3 class is given.
+
+    What a constructor does not name itself but takes as ``**kwargs`` is its base class's.
+    """
+    names: set[str] = set()
+    for base in cls.__mro__:
+        if "__init__" not in vars(base):
+            continue
+        parameters = inspect.signature(vars(base)["__init__"]).parameters
+        names.update(parameters)
+        if not any(one.kind is one.VAR_KEYWORD for one in parameters.values()):
+            break
+    given = "self args kwargs env observation_space action_space lr_schedule _init_setup_model"
+    return frozenset(names - {*given.split()})
+
+
+def check_arguments(policy: type, given: Iterable[str]) -> None:
+    """Check names of keyword arguments.
+
+    :raises ConfigError: for one that the policy class does not take
+    """
+    known = arguments_of(policy)
+    for name in given:
+        if name not in known:
+            raise ConfigError(
+                f"{policy.__name__} has no argument {name!r}{did_you_mean(name, known)}; it takes "
+                f"{', '.join(sorted(known))}"
+            )

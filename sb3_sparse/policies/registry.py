@@ -203,11 +203,11 @@ def sparse_counterpart(policy: BasePolicy) -> type[BaseSparsePolicy] | None:
     return None
 
 
-def writers_of(policy: type, attributes: Container[str]) -> list[str]:
+def writers_of(policy: type, attributes: Container[str] | None = None) -> list[str]:
     """Class names of the algorithms that may have saved a model, the likeliest first.
 
     :param policy: class of the model's policy
-    :param attributes: names of the model's attributes
+    :param attributes: names of the model's attributes; None: not known
     """
     known = registered()
     for cls in policy.__mro__:
@@ -215,6 +215,8 @@ def writers_of(policy: type, attributes: Container[str]) -> list[str]:
             break
         same = [n for n, one in known.items() if cls in one.algorithm.policy_aliases.values()]
         if same:
+            if attributes is None:
+                return same
             told = [name for name in same if known[name].told_by in attributes]
             return told or [name for name in same if not known[name].told_by]
     return []

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import ast
-import inspect
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from functools import cache
 from typing import TYPE_CHECKING, Any
 
 from sb3_sparse.errors import ConfigError, did_you_mean
+from sb3_sparse.policies.config import arguments_of
 from sb3_sparse.policies.named import import_path
 from sb3_sparse.topology import method_named
 
@@ -86,9 +85,9 @@ class Names:
         from sb3_sparse.callback import SparsityCallback
 
         return cls(
-            (_arguments(algorithm) - SET_BY_THE_ENGINE) | ZOO_KEYS,
-            _arguments(algorithm.policy_aliases[ALIAS]),
-            _arguments(SparsityCallback) - {"method", "verbose"},
+            (arguments_of(algorithm) - SET_BY_THE_ENGINE) | ZOO_KEYS,
+            arguments_of(algorithm.policy_aliases[ALIAS]),
+            arguments_of(SparsityCallback) - {"method", "verbose"},
         )
 
 
@@ -124,24 +123,6 @@ def apply_overrides(
 
 def _listed(names: Iterable[str]) -> str:
     return ", ".join(sorted(names))
-
-
-@cache
-def _arguments(cls: type) -> frozenset[str]:
-    """Names that a class takes when made, but those that every SB3 class is given.
-
-    What a constructor does not name itself but takes as ``**kwargs`` is its base class's.
-    """
-    names: set[str] = set()
-    for base in cls.__mro__:
-        if "__init__" not in vars(base):
-            continue
-        parameters = inspect.signature(vars(base)["__init__"]).parameters
-        names.update(parameters)
-        if not any(one.kind is one.VAR_KEYWORD for one in parameters.values()):
-            break
-    given = "self args kwargs env observation_space action_space lr_schedule _init_setup_model"
-    return frozenset(names - {*given.split()})
 
 
 def sparsity_callback(settings: Mapping[str, Any], wanted: str = "") -> dict[str, Any]:

@@ -157,3 +157,13 @@ def test_gradients_outside_of_training_are_left_alone():
     model.critic(obs, th.zeros(1, 3))[0].sum().backward()
     grads = [p.grad for p in model.critic.qf0.parameters()]
     assert all(g is not None for g in grads)
+
+
+@pytest.mark.parametrize("policy", ["SparsePolicy", "MlpPolicy"])
+def test_a_file_of_another_algorithm_is_told_from_a_damaged_one(policy, tmp_path):
+    kwargs = dict(sparsity=0.9) if policy == "SparsePolicy" else {}
+    model = stable_baselines3.SAC(policy, "Pendulum-v1", policy_kwargs=dict(kwargs, net_arch=[8]))
+    model.save(tmp_path / "model.zip")
+    with pytest.raises(TypeError, match="SACPolicy is a policy of SAC, not of PPO"):
+        sb3_sparse.PPO.load(tmp_path / "model.zip")
+    assert isinstance(sb3_sparse.SAC.load(tmp_path / "model.zip"), sb3_sparse.SAC)

@@ -1,8 +1,12 @@
 from __future__ import annotations
 
+import inspect
+from dataclasses import fields
+
 import pytest
 from support import make
 
+from sb3_sparse import SparseSACPolicy
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.policies.config import SparsityConfig
 
@@ -31,6 +35,19 @@ def test_values_that_are_not_allowed_are_named_with_what_is(wrong, message):
 def test_a_policy_without_sparsity_does_not_train_dense():
     with pytest.raises(ConfigError, match="needs its sparsity"):
         make("SAC", policy_kwargs=dict(sparsity=None))
+
+
+def test_a_mistyped_argument_is_named_with_the_nearest_one():
+    with pytest.raises(ConfigError, match="has no argument 'spasity' .did you mean 'sparsity'.*"):
+        make("SAC", policy="SparsePolicy", policy_kwargs=dict(spasity=0.9))
+    with pytest.raises(ConfigError, match="'net_arc' .did you mean 'net_arch'"):
+        make("SAC", policy_kwargs=dict(net_arc=[8]))
+
+
+def test_help_shows_the_sparse_arguments_of_a_policy():
+    shown = inspect.signature(SparseSACPolicy).parameters
+    for one in fields(SparsityConfig):
+        assert shown[one.name].default in (one.default, inspect.Parameter.empty)
 
 
 def test_each_network_can_have_its_own_sparsity():
