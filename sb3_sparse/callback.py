@@ -10,6 +10,7 @@ from sb3_sparse.engine.plan import Plan
 from sb3_sparse.errors import ConfigError, warn
 from sb3_sparse.policies.base import BaseSparsePolicy
 from sb3_sparse.policies.compiled import unwrapped
+from sb3_sparse.policies.internals import planned_timesteps
 from sb3_sparse.topology import method_named
 
 
@@ -148,7 +149,7 @@ class SparsityCallback(BaseCallback):
             )
 
     def _note_progress(self) -> None:
-        planned = self.model._total_timesteps
+        planned = planned_timesteps(self.model)
         progress = self.model.num_timesteps / planned if planned else 1.0
         self._sparse_policy().sparse.progress = progress
 

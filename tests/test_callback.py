@@ -116,8 +116,9 @@ def test_trpos_actor_grows_by_the_gradient_of_its_objective(gradient_spy):
                 (grad, *_) = th.autograd.grad(policy_objective, masked, retain_graph=True)
                 layer.weight._backward_hooks = hooks
             objective.setdefault(layer.name, []).append(grad.numpy().ravel().copy())
-        for mask in model.policy.sparse._gradient_masks.values():
-            mask.dense_grad = None
+        for layer in model.policy.sparse.layers:
+            if layer.gradient is not None:
+                layer.gradient.dense_grad = None
         return compute(kl_div, policy_objective)
 
     model._compute_actor_grad = spied

@@ -21,6 +21,7 @@ from sb3_sparse.fused.machine import Machine
 from sb3_sparse.fused.optimizers import KNOWN, Known, rmsprop
 from sb3_sparse.fused.program import Program
 from sb3_sparse.fused.values import Value
+from sb3_sparse.policies.internals import samples
 from sb3_sparse.policies.shortcut import takes_vectors
 
 METHODS: dict[str, tuple[str, ...]] = {
@@ -165,7 +166,7 @@ class OnPolicy(Fused, OnPolicyAlgorithm):
         """Let SB3's distribution say what it does not take: means that are not finite, say."""
         data, buffer = part.data, self.rollout_buffer
         if data is None:
-            data = buffer._get_samples(part.rows)
+            data = samples(buffer, part.rows)
         actions = data.actions
         if isinstance(self.action_space, spaces.Discrete):
             actions = actions.long().flatten()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from itertools import chain
-from operator import attrgetter, itemgetter
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -15,10 +15,10 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.preprocessing import preprocess_obs
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
-from torch.nn.modules.module import _has_any_global_hook
 
 from sb3_sparse.engine.activations import ACTIVATIONS, ADJUSTABLE, number_of
 from sb3_sparse.engine.changes import ChangeDetector, patched
+from sb3_sparse.engine.internals import any_global_hook, module_hooks
 from sb3_sparse.engine.linear import SparseLinear
 from sb3_sparse.engine.native.library import why_missing
 from sb3_sparse.engine.paths import parts_of
@@ -32,7 +32,6 @@ from sb3_sparse.policies.registry import registered, writers_of
 from sb3_sparse.policies.shortcut import only_flattens, takes_vectors, untouched
 from sb3_sparse.policies.storage import KNOWN
 
-HOOKS = itemgetter("_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_pre_hooks")
 SEEN = attrgetter("requires_grad", "_backward_hooks", "_post_accumulate_grad_hooks")
 KNOWN_MODULES = (nn.Linear, SparseLinear, nn.Identity, *ACTIVATIONS)
 Build = Callable[[Program], None]
@@ -96,7 +95,7 @@ class Training:
         for name in methods:
             if vars(model).get(name) is not policy._modules.get(name) and hasattr(model, name):
                 raise NotCovered(f"{name} is another module in the model than in its policy")
-        if any(chain.from_iterable(map(HOOKS, self._hooked))) or _has_any_global_hook():  # type: ignore[no-untyped-call]
+        if any(chain.from_iterable(map(module_hooks, self._hooked))) or any_global_hook():
             raise NotCovered("hooks on modules")
         tensors = [*self._tensors, *others]
         found = chain.from_iterable(map(SEEN, tensors))

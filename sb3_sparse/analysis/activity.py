@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from torch import nn
-from torch.utils import _pytree as pytree
 
 from sb3_sparse.analysis.networks import dense_twin, modules_of, prunable_of, specs_of
+from sb3_sparse.engine.internals import pytree
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.policies.spec import output_layers

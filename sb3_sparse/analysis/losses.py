@@ -12,10 +12,11 @@ from gymnasium import spaces
 from stable_baselines3 import DQN, PPO, SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
 from torch.nn import functional as F
-from torch.utils import _pytree as pytree
 
 from sb3_sparse.algorithms.table import trainer_of
+from sb3_sparse.engine.internals import pytree
 from sb3_sparse.errors import ConfigError
+from sb3_sparse.policies.internals import progress_remaining
 
 Samples = dict[str, Any]
 MakeLosses = Callable[[Any, Any, Any], "list[Loss]"]
@@ -126,7 +127,7 @@ def _sac(model: Any, policy: Any, batch: Any) -> list[Loss]:
 
 @register_losses(PPO)
 def _ppo(model: Any, policy: Any, batch: Any) -> list[Loss]:
-    progress = model._current_progress_remaining
+    progress = progress_remaining(model)
     clip = model.clip_range(progress)
     clip_vf = None if model.clip_range_vf is None else model.clip_range_vf(progress)
     advantages = batch.advantages

@@ -11,12 +11,12 @@ import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from torch import nn
 from torch.func import functional_call, grad, vmap
-from torch.utils import _pytree as pytree
 
 from sb3_sparse.analysis.batches import own_randomness, sample_batch
 from sb3_sparse.analysis.losses import Loss, losses_for, unchecked_distributions
 from sb3_sparse.analysis.measurement import MeasurementCallback
 from sb3_sparse.analysis.networks import connections, dense_twin, parameters_by_network
+from sb3_sparse.engine.internals import pytree
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.sparsity.numeric import is_whole

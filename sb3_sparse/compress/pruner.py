@@ -20,14 +20,13 @@ from sb3_sparse.errors import CorruptStateError
 from sb3_sparse.files import written_whole
 from sb3_sparse.loading.guard import reading
 from sb3_sparse.loading.statistics import load_statistics
+from sb3_sparse.policies.internals import LAST_SEEN
 
 LEVELS = "levels"
 VECNORMALIZE = "vecnormalize.pkl"
 SEEDS_PER_BATCH = 1000
 """More than there are environments, each of which gets a seed of its own."""
 NORMALIZATION = ("obs_rms", "ret_rms")
-WHEREABOUTS = ("_last_obs", "_last_original_obs", "_last_episode_starts")
-"""Where a model is in its environment."""
 
 
 class ModelPruner:
@@ -103,7 +102,7 @@ class ModelPruner:
         self._set_statistics(self.model.env, self._kept)
         if isinstance(self.accepted, OffPolicyAlgorithm):
             # The environment goes on where the last model left it, as the replay buffer expects.
-            for name in WHEREABOUTS:
+            for name in LAST_SEEN:
                 setattr(self.accepted, name, copy.deepcopy(getattr(self._played_last, name)))
             self.accepted.set_random_seed(self.seed)
             fill_buffer(self.accepted)

@@ -20,6 +20,7 @@ from sb3_sparse.errors import ConfigError, UnsupportedError
 from sb3_sparse.loading.zips import check_finite
 from sb3_sparse.policies.base import BaseSparsePolicy
 from sb3_sparse.policies.compiled import unwrapped
+from sb3_sparse.policies.internals import has_own_logger, no_schedule
 from sb3_sparse.policies.registry import supported_algorithms
 from sb3_sparse.policies.saving import load_without_buffer, parts_of
 from sb3_sparse.sparsity.selection import largest
@@ -81,7 +82,7 @@ def sparsify(
     save_to_zip_file(twin_file, data=data, params=params, pytorch_variables=variables)
     twin_file.seek(0)
     twin = load_beside(model, twin_file, force_reset=False)
-    if model._custom_logger:
+    if has_own_logger(model):
         twin.set_logger(model.logger)
     policy = sparse_policy(twin)
     for layer in policy.sparse.layers:
@@ -205,6 +206,4 @@ def _masked_policy(data: Mapping[str, Any]) -> BaseSparsePolicy:
     if data["use_sde"]:
         kwargs["use_sde"] = True
     with th.random.fork_rng(devices=[]):
-        return policy_class(
-            data["observation_space"], data["action_space"], policy_class._dummy_schedule, **kwargs
-        )
+        return policy_class(data["observation_space"], data["action_space"], no_schedule, **kwargs)

@@ -8,8 +8,8 @@ from weakref import ref
 
 import torch as th
 from torch import nn
-from torch.autograd import forward_ad
 
+from sb3_sparse.engine.internals import watching
 from sb3_sparse.engine.products import ChainPass, Products
 from sb3_sparse.engine.structure import Structure
 from sb3_sparse.errors import UnsupportedError
@@ -92,13 +92,3 @@ class Chain:
 def watched(x: th.Tensor) -> bool:
     """Whether somebody wants to see single operations on ``x``, e.g. by fake tensors."""
     return type(x) not in PLAIN or watching()
-
-
-def watching() -> bool:
-    """Whether somebody wants to see single operations: tracing, dispatch modes, torch.func."""
-    return (
-        th._C._get_tracing_state() is not None
-        or th._C._len_torch_dispatch_stack() > 0
-        or th._C._functorch.peek_interpreter_stack() is not None
-        or forward_ad._current_level >= 0
-    )

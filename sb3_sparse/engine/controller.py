@@ -13,7 +13,6 @@ from torch.utils.hooks import RemovableHandle
 
 from sb3_sparse.engine.auto import AutoCompute
 from sb3_sparse.engine.foreign import watch
-from sb3_sparse.engine.gradients import GradientMask
 from sb3_sparse.engine.hooks import Hooks
 from sb3_sparse.engine.network import SparseNetwork
 from sb3_sparse.engine.optimizers import (
@@ -62,13 +61,12 @@ class Controller:
         """Updates that have come due since the plan was made, of all networks together."""
         self.soft_targets = False
         """Whether targets follow a mask at once; as long as nobody says so, they need not."""
-        self._gradient_masks: dict[str, GradientMask] = {}
         self._gradient_hooks, self._optimizer_hooks = Hooks(), Hooks()
         self._dense = not any(network.sparse_layers for network in networks)  # and it stays so
         self._warned = self._dense
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "plan": None, "_in_force": bool, "_gradient_masks": {}}
+        return {**self.__dict__, "plan": None, "_in_force": bool}
 
     @property
     def layers(self) -> Iterable[LayerStorage]:
@@ -102,13 +100,14 @@ class Controller:
 
     def _hook_gradients(self) -> list[RemovableHandle]:
         functional = self.functional_gradients
-        self._gradient_masks = {
-            layer.name: layer.gradient_mask(functional, partial(self._capturing, network))
+        for layer in self.layers:
+            layer.gradient = None
+        return [
+            layer.hook_gradient(functional, partial(self._capturing, network))
             for network in self.networks
             for layer in network.sparse_layers
             if not layer.frozen
-        }
-        return [mask.attach() for mask in self._gradient_masks.values()]
+        ]
 
     def _hook_optimizers(self) -> list[RemovableHandle]:
         handles: list[RemovableHandle] = []
@@ -170,8 +169,9 @@ class Controller:
         self.choose_storage(root)
         if not self._in_force():
             self.plan = None  # of a training that was interrupted
-        for mask in self._gradient_masks.values():
-            mask.dense_grad = None
+        for layer in self.layers:
+            if layer.gradient is not None:
+                layer.gradient.dense_grad = None
         for network in self.networks:
             network.settle(self.soft_targets)
 
@@ -265,13 +265,8 @@ class Controller:
         for network in self._owned_by(optimizer):
             network.clock += 1
 
-    def note_gradient(self, layer: LayerStorage, dense_grad: th.Tensor) -> None:
-        """Hear of a layer's dense gradient at the step that is about to be taken."""
-        if layer.name in self._gradient_masks:
-            self._gradient_masks[layer.name].dense_grad = lambda: dense_grad
-
     def _update_if_due(self, network: SparseNetwork, plan: Plan) -> None:
-        gradients = network.take_gradients(self._gradient_masks)
+        gradients = network.take_gradients()
         if network.due(plan, network.clock, self.progress):
             self.updates_due += 1
             computed = {name: None if g is None else g() for name, g in gradients.items()}

@@ -19,11 +19,11 @@ import torch as th
 from numpy.typing import NDArray
 from torch import nn
 from torch.compiler import is_compiling
-from torch.nn.modules.module import _has_any_global_hook
 
 from sb3_sparse.engine.activations import ADJUSTABLE, number_of
-from sb3_sparse.engine.chains import watched, watching
+from sb3_sparse.engine.chains import watched
 from sb3_sparse.engine.changes import patched
+from sb3_sparse.engine.internals import any_global_hook, watching
 from sb3_sparse.engine.linear import TRIES, SparseLinear
 from sb3_sparse.engine.masked import FLOAT_MASK_KEY, MaskedStorage
 from sb3_sparse.engine.native.library import bits_of, library, readable, why_missing
@@ -137,9 +137,7 @@ class Inference:
     @property
     def watched(self) -> bool:
         """Whether somebody wants to see the modules called, or in another precision."""
-        return (
-            any(self._hooks) or th.is_autocast_enabled("cpu") or bool(_has_any_global_hook())  # type: ignore[no-untyped-call]
-        )
+        return any(self._hooks) or th.is_autocast_enabled("cpu") or bool(any_global_hook())
 
     def __call__(self, x: th.Tensor) -> list[th.Tensor] | None:
         """Each network's result, shape ``(n, its outputs)``, without a graph.

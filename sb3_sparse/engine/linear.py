@@ -10,6 +10,7 @@ import torch as th
 from torch import nn
 
 from sb3_sparse.engine.chains import Chain
+from sb3_sparse.engine.internals import become, replace_data
 from sb3_sparse.engine.structure import Structure
 from sb3_sparse.errors import UnsupportedError
 
@@ -64,8 +65,7 @@ class SparseLinear(nn.Linear):
     def convert(cls, module: nn.Linear, structure: Structure, is_target: bool) -> SparseLinear:
         """Make ``module`` sparse, in place; its Parameter stays the same object."""
         dense = module.weight.detach()
-        module.__class__ = cls  # the usual trick, also of torch's own parametrizations
-        assert isinstance(module, cls)
+        module = become(module, cls)
         module.structure = structure
         module.snapshot = None
         module.is_target = is_target
@@ -78,7 +78,7 @@ class SparseLinear(nn.Linear):
     def to_linear(self) -> None:
         """Become ``nn.Linear`` again, in place; the Parameter stays the same object."""
         dense = self.dense()
-        self.__class__ = nn.Linear  # type: ignore[assignment]
+        become(self, nn.Linear)
         for name in ("structure", "snapshot", "is_target", "listener", "check_mask"):
             del vars(self)[name]
         replace_data(self.weight, dense)
@@ -233,16 +233,3 @@ def check_conversion(fn: Callable[[th.Tensor], th.Tensor]) -> None:
             "layers in sparse storage stay float32 on the CPU, and cannot become "
             f"{probe.dtype} on {probe.device}; make the policy with compute='masked'"
         )
-
-
-def replace_data(parameter: nn.Parameter, data: th.Tensor) -> None:
-    """Give a Parameter other data, perhaps of another size; it stays the same object."""
-    if parameter.shape == data.shape:
-        with th.no_grad():
-            parameter.copy_(data)
-        return
-    # While a graph of earlier passes is alive, autograd goes on to expect gradients of the old
-    # size. A change of type makes it forget.
-    parameter.grad = None
-    parameter.data = parameter.new_empty(0, dtype=th.float64)
-    parameter.data = data

@@ -166,7 +166,7 @@ class MaskedStorage(LayerStorage):
         weight = self.weight
         self._seen = weight._version, weight.data_ptr()
 
-    def gradient_mask(self, functional: bool, capturing: Callable[[], bool]) -> GradientMask:
+    def _gradient_mask(self, functional: bool, capturing: Callable[[], bool]) -> GradientMask:
         return (FunctionalGradient if functional else AccumulatedGradient)(self, capturing)
 
     def settle_moments(self, optimizers: Sequence[th.optim.Optimizer]) -> None:

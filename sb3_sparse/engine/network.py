@@ -7,7 +7,7 @@ from collections.abc import Container, Mapping, Sequence
 import torch as th
 from torch import nn
 
-from sb3_sparse.engine.gradients import DenseGradient, GradientMask
+from sb3_sparse.engine.gradients import DenseGradient
 from sb3_sparse.engine.masked import MaskedStorage
 from sb3_sparse.engine.plan import Plan
 from sb3_sparse.engine.prunable import Prunable
@@ -180,11 +180,10 @@ class SparseNetwork:
             and ((self.clock + 1) % plan.update_interval == 0 or self.must_finish(plan, progress))
         )
 
-    def take_gradients(self, masks: dict[str, GradientMask]) -> dict[str, DenseGradient | None]:
+    def take_gradients(self) -> dict[str, DenseGradient | None]:
         """Dense gradients of the step that is about to happen, by layer name."""
-        return {
-            layer.name: masks[layer.name].take() for layer in self.layers if layer.name in masks
-        }
+        hooked = ((layer.name, layer.gradient) for layer in self.layers)
+        return {name: gradient.take() for name, gradient in hooked if gradient is not None}
 
     def move(
         self,

@@ -10,6 +10,7 @@ from typing import Any
 import torch as th
 from torch import nn
 
+from sb3_sparse.engine.internals import STEP_HOOKS
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.sparsity.numeric import is_number
 
@@ -81,7 +82,7 @@ def _trial(
     copied.state = defaultdict(dict)
     group = {**optimizer.param_groups[0], "params": [parameter], "lr": 0.01}
     copied.param_groups = [group]
-    for hooks in ("_optimizer_step_pre_hooks", "_optimizer_step_post_hooks"):
+    for hooks in STEP_HOOKS:
         setattr(copied, hooks, OrderedDict())
     for step in range(3):
         parameter.grad = grad(step)

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 
 from torch import nn
 
+from sb3_sparse.engine.internals import WRAPPED
 from sb3_sparse.engine.linear import MASK_KEY
 from sb3_sparse.engine.storage import LayerStorage
 from sb3_sparse.errors import UnsupportedError
@@ -38,6 +39,6 @@ def _module_at(root: nn.Module, name: str) -> nn.Module | None:
     module: nn.Module | None = root
     for part in name.split("."):
         module = None if module is None else module._modules.get(part)
-        if module is not None and "_orig_mod" in module._modules:
-            module = module._modules["_orig_mod"]
+        if module is not None and WRAPPED in module._modules:
+            module = module._modules[WRAPPED]
     return module

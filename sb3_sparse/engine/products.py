@@ -16,22 +16,19 @@ from torch import nn
 from torch.nn import functional
 
 from sb3_sparse.engine.activations import number_of
-from sb3_sparse.engine.native.library import BatchArgument, bits_of, library, readable
+from sb3_sparse.engine.internals import stands_for_many
+from sb3_sparse.engine.native.library import BatchArgument, LayerArgument, library, readable
 from sb3_sparse.engine.structure import Structure
 from sb3_sparse.errors import UnsupportedError
 
 TILE = 64
-FIELDS = 16
-VALUE_GRAD, BIAS_GRAD, OUTPUT_GRAD = 13, 14, 15
-"""Places of a layer's fields in ``layer_t`` of ``kernels.h`` that only the way back fills."""
-
 
 # Whatever torch's defaults are: the kernels read and write this and nothing else.
 _empty = partial(th.empty, dtype=th.float32, device="cpu")
 
 
 def _tiles(batch: int, features: int) -> th.Tensor:
-    """Room for a batch in tiles; what fills up the last one is 0, lest somebody looks at it."""
+    """Memory for a batch in tiles; the unused end of the last tile is 0, in case it is read."""
     tiles = _empty(tiles_of(batch), features, TILE)
     if batch % TILE:
         tiles[-1].zero_()
@@ -44,7 +41,15 @@ def tiles_of(batch: int) -> int:
 
 
 class ChainPass(NamedTuple):
-    """One way forth, and perhaps back, of a batch through a chain."""
+    """One forward pass of a batch through a chain, and the backward pass if there is one.
+
+    :param activations: what follows each layer
+    :param structures: connections of each layer
+    :param layers: weak references to the layers
+    :param batch: entries of the batch
+    :param tiled_in: whether the input comes in tiles
+    :param tiled_out: whether the result shall be in tiles
+    """
 
     activations: list[nn.Module | None]
     structures: list[Structure]
@@ -61,40 +66,37 @@ class ChainPass(NamedTuple):
     def rows(self) -> int:
         return self.structures[-1].shape[0]
 
-    def arguments(self, parameters: Sequence[Any], outputs: Sequence[int]) -> list[int]:
-        """``layer_t`` of every layer, without the gradients."""
-        arguments: list[int] = []
-        for i, structure in enumerate(self.structures):
-            values, bias = parameters[2 * i : 2 * i + 2]
+    def _arguments(self, parameters: Sequence[Any], outputs: Sequence[int]) -> Any:
+        """An array of ``layer_t``, without the gradients.
+
+        :param parameters: values and bias of each layer
+        :param outputs: address of each layer's output
+        """
+        arguments: list[LayerArgument] = []
+        for structure, activation, values, bias, output in zip(
+            self.structures, self.activations, parameters[::2], parameters[1::2], outputs,
+            strict=True,
+        ):  # fmt: skip
             for parameter in (values, bias):
                 if parameter is not None and not readable(parameter):
                     raise UnsupportedError(
-                        "weights and biases of layers in sparse storage must be "
-                        f"contiguous float32 on the CPU, got {parameter.dtype} on "
-                        f"{parameter.device} with strides {parameter.stride()}"
+                        "weights and biases of layers in sparse storage must be contiguous float32 "
+                        f"on the CPU, got {parameter.dtype} on {parameter.device} with strides "
+                        f"{parameter.stride()}"
                     )
             if values.numel() != structure.nnz:
                 raise RuntimeError("a layer's connections have changed while it was computing")
-            kind, a, b = number_of(self.activations[i])
-            arguments += (
-                *structure.shape,
-                kind,
-                bits_of(a),
-                bits_of(b),
-                *structure.addresses,
-                values.data_ptr(),
-                0 if bias is None else bias.data_ptr(),
-                outputs[i],
-                0,
-                0,
-                0,
-            )
-        return arguments
+            bias_at = 0 if bias is None else bias.data_ptr()
+            arguments.append(
+                LayerArgument(
+                    *structure.shape, *number_of(activation), *structure.addresses,
+                    values.data_ptr(), bias_at, output,
+                )
+            )  # fmt: skip
+        return (LayerArgument * len(arguments))(*arguments)
 
-    def forward(
-        self, x: th.Tensor, parameters: Sequence[Any]
-    ) -> tuple[th.Tensor, th.Tensor, list[int]]:
-        """Result, workspace with all activations in tiles (but a tiled result), and arguments."""
+    def forward(self, x: th.Tensor, parameters: Sequence[Any]) -> tuple[th.Tensor, th.Tensor, Any]:
+        """The result, all other activations in tiles, and the array of ``layer_t``."""
         tiles = tiles_of(self.batch)
         widths = self._widths()
         y = _tiles(self.batch, self.rows) if self.tiled_out else _empty(self.batch, self.rows)
@@ -107,8 +109,8 @@ class ChainPass(NamedTuple):
         outputs = places[0 if self.tiled_in else 1 :]
         if self.tiled_out:
             outputs.append(y.data_ptr())
-        arguments = self.arguments(parameters, outputs)
-        how = BatchArgument(
+        arguments = self._arguments(parameters, outputs)
+        batch = BatchArgument(
             layers=len(self.structures),
             batch=self.batch,
             threads=th.get_num_threads(),
@@ -116,18 +118,71 @@ class ChainPass(NamedTuple):
             rows_in=0 if self.tiled_in else x.data_ptr(),
             rows_out=0 if self.tiled_out else y.data_ptr(),
         )
-        library().sb3_sparse_forward(
-            (ctypes.c_int64 * len(arguments))(*arguments), ctypes.byref(how)
-        )
+        library().sb3_sparse_forward(arguments, ctypes.byref(batch))
         return y, work, arguments
+
+    def backward(
+        self,
+        x: th.Tensor,
+        work: th.Tensor,
+        parameters: Sequence[th.Tensor | None],
+        needs: Sequence[bool],
+        grad: th.Tensor,
+        arguments: Any,
+    ) -> list[th.Tensor | None]:
+        """Gradients of the input and of each parameter; None where not needed.
+
+        :param work: activations as :meth:`forward` left them
+        :param needs: whether the gradient of the input and of each parameter is needed
+        :param grad: of the result
+        :param arguments: an array of ``layer_t`` of its own, to be filled in
+        """
+        needs_x, *needed = needs
+        grads = [
+            th.empty_like(parameter) if need and parameter is not None else None
+            for parameter, need in zip(parameters, needed, strict=True)
+        ]
+        listening: list[tuple[int, Any, th.Tensor]] = []
+        for i, (layer, argument) in enumerate(zip(self.layers, arguments, strict=True)):
+            values_grad, bias_grad = grads[2 * i : 2 * i + 2]
+            if bias_grad is not None:
+                argument.bias_grad = bias_grad.data_ptr()
+            if values_grad is None:
+                continue
+            argument.value_grad = values_grad.data_ptr()
+            listener = None if (module := layer()) is None else module.listener
+            if listener is not None and listener.wanted():
+                output_grad = _empty(tiles_of(self.batch), argument.rows, TILE)
+                argument.output_grad = output_grad.data_ptr()
+                listening.append((i, listener, output_grad))
+        grad_x = None
+        if needs_x:
+            grad_x = _tiles(self.batch, self.columns) if self.tiled_in else th.empty_like(x)
+        to = 0 if grad_x is None else grad_x.data_ptr()
+        batch = BatchArgument(
+            layers=len(self.structures),
+            batch=self.batch,
+            threads=th.get_num_threads(),
+            input=x.data_ptr() if self.tiled_in else work.data_ptr(),
+            rows_grad=0 if self.tiled_out else grad.data_ptr(),
+            tiles_grad=grad.data_ptr() if self.tiled_out else 0,
+            rows_input_grad=0 if self.tiled_in else to,
+            tiles_input_grad=to if self.tiled_in else 0,
+        )
+        if library().sb3_sparse_backward(arguments, ctypes.byref(batch)):
+            raise MemoryError("no memory for the gradient of a chain of sparse layers")
+        inputs = self._inputs(x, work) if listening else []
+        for i, listener, output_grad in listening:
+            listener.note(partial(_outer, output_grad, inputs[i], self.batch))
+        return [grad_x, *grads]
 
     def _widths(self) -> list[int]:
         """Features of what the workspace holds: the input and each output, but what is tiled."""
         widths = [self.columns, *(structure.shape[0] for structure in self.structures)]
         return widths[1 if self.tiled_in else 0 : -1 if self.tiled_out else None]
 
-    def inputs(self, x: th.Tensor, work: th.Tensor) -> list[th.Tensor]:
-        """Each layer's input in tiles, as the way forth left it."""
+    def _inputs(self, x: th.Tensor, work: th.Tensor) -> list[th.Tensor]:
+        """Each layer's input in tiles, as the forward pass left it."""
         tiles = tiles_of(self.batch)
         widths = self._widths()
         parts = th.split(work, [tiles * TILE * width for width in widths])
@@ -162,8 +217,8 @@ class Products(th.autograd.Function):
     def forward(ctx: Any, how: ChainPass, x: th.Tensor, *parameters: Any) -> th.Tensor:
         y, work, arguments = how.forward(x, parameters)
         ctx.how, ctx.arguments = how, arguments
-        # A tiled result is looked at on the way back where an activation made it. Where none did,
-        # one that works in place may change it.
+        # The backward pass reads a tiled result where an activation made it. Where none did, an
+        # activation that works in place may change it.
         kept = y if how.tiled_out and how.activations[-1] is not None else None
         ctx.save_for_backward(x, work, kept, *parameters)
         return y
@@ -172,68 +227,26 @@ class Products(th.autograd.Function):
     def backward(ctx: Any, *gradients: Any) -> Any:
         how: ChainPass = ctx.how
         x, work, _, *parameters = ctx.saved_tensors
-        needs_x, *needs = ctx.needs_input_grad[1:]
-        pairs = list(zip((x, *parameters), (needs_x, *needs), strict=True))
+        needs = ctx.needs_input_grad[1:]
         # The gradient shall itself be differentiable (TRPO asks for it), or is many at once.
         again = th.is_grad_enabled()
-        if again or _many(gradients[0]):
+        if again or stands_for_many(gradients[0]):
             with th.enable_grad():
                 result = how.by_dense_weights(x, parameters)
-            wanted = [tensor for tensor, need in pairs if need]
+            wanted = [tensor for tensor, need in zip((x, *parameters), needs, strict=True) if need]
             found = iter(th.autograd.grad(result, wanted, gradients, create_graph=again))
-            return None, *(next(found) if need else None for _, need in pairs)
+            return None, *(next(found) if need else None for need in needs)
         for structure, values in zip(how.structures, parameters[::2], strict=True):
             if values.numel() != structure.nnz:
                 raise RuntimeError(
                     "a layer's connections have changed between its forward and its backward pass"
                 )
         if how.batch == 0:
-            return None, *(th.zeros_like(tensor) if need else None for tensor, need in pairs)
+            tensors = zip((x, *parameters), needs, strict=True)
+            return None, *(th.zeros_like(tensor) if need else None for tensor, need in tensors)
         grad = gradients[0].contiguous().resolve_neg()
-        arguments = list(ctx.arguments)
-        grads: list[th.Tensor | None] = []
-        for i, (parameter, need) in enumerate(zip(parameters, needs, strict=True)):
-            made = th.empty_like(parameter) if need else None
-            grads.append(made)
-            if made is not None:
-                field = BIAS_GRAD if i % 2 else VALUE_GRAD
-                arguments[FIELDS * (i // 2) + field] = made.data_ptr()
-        listening: list[tuple[int, Any, th.Tensor]] = []
-        for i, reference in enumerate(how.layers):
-            listener = None if (layer := reference()) is None else layer.listener
-            if needs[2 * i] and listener is not None and listener.wanted():
-                left = _empty(tiles_of(how.batch), how.structures[i].shape[0], TILE)
-                arguments[FIELDS * i + OUTPUT_GRAD] = left.data_ptr()
-                listening.append((i, listener, left))
-        grad_x = None
-        if needs_x:
-            grad_x = _tiles(how.batch, how.columns) if how.tiled_in else th.empty_like(x)
-        to = 0 if grad_x is None else grad_x.data_ptr()
-        argument = BatchArgument(
-            layers=len(how.structures),
-            batch=how.batch,
-            threads=th.get_num_threads(),
-            input=x.data_ptr() if how.tiled_in else work.data_ptr(),
-            rows_grad=0 if how.tiled_out else grad.data_ptr(),
-            tiles_grad=grad.data_ptr() if how.tiled_out else 0,
-            rows_input_grad=0 if how.tiled_in else to,
-            tiles_input_grad=to if how.tiled_in else 0,
-        )
-        failed = library().sb3_sparse_backward(
-            (ctypes.c_int64 * len(arguments))(*arguments), ctypes.byref(argument)
-        )
-        if failed:
-            raise MemoryError("no memory for the gradient of a chain of sparse layers")
-        inputs = how.inputs(x, work) if listening else []
-        for i, listener, left in listening:
-            listener.note(partial(_outer, left, inputs[i], how.batch))
-        return None, grad_x, *grads
-
-
-def _many(gradient: th.Tensor) -> bool:
-    """Whether it stands for several gradients at once: ``is_grads_batched``, ``torch.func``."""
-    kinds = th._C._functorch
-    return bool(kinds.is_legacy_batchedtensor(gradient) or kinds.is_batchedtensor(gradient))
+        arguments = type(ctx.arguments).from_buffer_copy(ctx.arguments)
+        return None, *how.backward(x, work, parameters, needs, grad, arguments)
 
 
 def _outer(output_grad: th.Tensor, x: th.Tensor, batch: int) -> th.Tensor:

@@ -7,17 +7,16 @@ from typing import Any
 
 import torch as th
 from torch import nn
-from torch.nn.modules.module import _has_any_global_hook
 
 from sb3_sparse.engine.activations import ACTIVATIONS, ADJUSTABLE, tells_its_slope
 from sb3_sparse.engine.chains import Chain, watched
 from sb3_sparse.engine.inference import by_modules
+from sb3_sparse.engine.internals import MODULE_HOOKS, any_global_hook, become
 from sb3_sparse.engine.kept import KeptInference
 from sb3_sparse.engine.linear import SparseLinear
 
 ELEMENTWISE = (*ACTIVATIONS, nn.Identity)
 """Activations that may work on tiles as they are."""
-HOOKS = ("_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_pre_hooks")
 
 
 class ChainedSequential(nn.Sequential):
@@ -43,9 +42,9 @@ class ChainedSequential(nn.Sequential):
             if results is not None:
                 return results[0]
         modules = tuple(self._modules.values())
-        hooked = any(getattr(module, hooks) for module in modules for hooks in HOOKS)
+        hooked = any(getattr(module, hooks) for module in modules for hooks in MODULE_HOOKS)
         hooked = hooked or any("forward" in vars(module) for module in modules)
-        if hooked or watched(input) or _has_any_global_hook():  # type: ignore[no-untyped-call]
+        if hooked or watched(input) or any_global_hook():
             y: th.Tensor = super().forward(input)  # type: ignore[no-untyped-call]
             return y
         if modules != self._seen or not all(map(tells_its_slope, self._adjustable)):
@@ -105,7 +104,7 @@ def chain_up(root: nn.Module) -> None:
         if type(module) not in (nn.Sequential, ChainedSequential):
             continue
         if any(isinstance(child, SparseLinear) for child in module.children()):
-            module.__class__ = ChainedSequential
+            become(module, ChainedSequential)
             # More of them may be sparse now.
             vars(module).update(_seen=(), _steps=[], _adjustable=[], _kept=KeptInference())
         elif type(module) is ChainedSequential:
@@ -114,5 +113,5 @@ def chain_up(root: nn.Module) -> None:
 
 def unchain(module: ChainedSequential) -> None:
     """Make it a plain ``Sequential`` again, in place."""
-    module.__class__ = nn.Sequential  # type: ignore[assignment]
     del module._seen, module._steps, module._adjustable, module._kept
+    become(module, nn.Sequential)

@@ -85,7 +85,7 @@ class SparseStorage(LayerStorage):
     def _dense_targets(self) -> Iterable[NDArray[np.float32]]:
         return (target.dense().numpy() for target in self._targets)
 
-    def gradient_mask(self, functional: bool, capturing: Callable[[], bool]) -> GradientMask:
+    def _gradient_mask(self, functional: bool, capturing: Callable[[], bool]) -> GradientMask:
         return SparseStorageGradient(self, functional, capturing)
 
     def settle_moments(self, optimizers: Sequence[th.optim.Optimizer]) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 import torch as th
 from numpy.typing import NDArray
 from torch import nn
+from torch.utils.hooks import RemovableHandle
 
 from sb3_sparse.engine.gradients import GradientMask
 from sb3_sparse.engine.linear import MASK_KEY
@@ -36,6 +37,11 @@ class LayerStorage(ABC):
         self.final_nnz = self.size
         self.moments_stale = False
         """Whether an optimizer may remember what does not fit the mask."""
+        self.gradient: GradientMask | None = None
+        """Hook on the weight's gradient; None while the weight is frozen or has no hook."""
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "gradient": None}  # a copy gets its own when it is hooked
 
     @property
     def weight(self) -> nn.Parameter:
@@ -148,13 +154,22 @@ class LayerStorage(ABC):
     def _after_target_load(self, module: nn.Module, incompatible_keys: object) -> None:
         self.settle_targets(soft=False)
 
-    @abstractmethod
-    def gradient_mask(self, functional: bool, capturing: Callable[[], bool]) -> GradientMask:
-        """What keeps gradients true to the mask.
+    def hook_gradient(self, functional: bool, capturing: Callable[[], bool]) -> RemovableHandle:
+        """Keep gradients true to the mask from now on.
 
         :param functional: whether the algorithm uses ``torch.autograd.grad``
         :param capturing: whether the dense gradient will be wanted at the next step
         """
+        self.gradient = self._gradient_mask(functional, capturing)
+        return self.gradient.attach()
+
+    @abstractmethod
+    def _gradient_mask(self, functional: bool, capturing: Callable[[], bool]) -> GradientMask: ...
+
+    def note_gradient(self, dense_grad: th.Tensor) -> None:
+        """Hear of the dense gradient at the step that is about to be taken."""
+        if self.gradient is not None:
+            self.gradient.dense_grad = lambda: dense_grad
 
     @abstractmethod
     def settle_moments(self, optimizers: Sequence[th.optim.Optimizer]) -> None:

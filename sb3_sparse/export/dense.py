@@ -19,14 +19,13 @@ from sb3_sparse.export.pathless import pickled
 from sb3_sparse.policies.base import BaseSparsePolicy
 from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.policies.config import SparsityConfig
+from sb3_sparse.policies.internals import LAST_SEEN
 from sb3_sparse.policies.named import import_named
 from sb3_sparse.policies.saving import parts_of
 
 STOCK = ("stable_baselines3.", "sb3_contrib.")
 FORGOTTEN = (
-    "_last_obs",
-    "_last_original_obs",
-    "_last_episode_starts",
+    *LAST_SEEN,
     "ep_info_buffer",
     "ep_success_buffer",
     "tensorboard_log",

@@ -8,9 +8,9 @@ from operator import itemgetter
 from typing import Any, NamedTuple
 
 import torch as th
-from torch.optim import optimizer as torch_optimizer
 
 from sb3_sparse.engine.controller import Controller
+from sb3_sparse.engine.internals import step_hooks
 from sb3_sparse.engine.native.library import bits_of
 
 FIELDS = 7
@@ -125,7 +125,7 @@ class Steps:
             return
         optimizer = self._optimizer
         settings = list(map(self._getter, optimizer.param_groups))
-        hooks = ["step" in vars(optimizer), *map(len, self._hooked())]
+        hooks = ["step" in vars(optimizer), *map(len, step_hooks(self._optimizer))]
         if settings == self._settings and hooks == self._hooks:
             return
         self._settings, self._hooks = settings, hooks
@@ -135,18 +135,9 @@ class Steps:
             if None not in groups:
                 self.groups = groups  # type: ignore[assignment]
 
-    def _hooked(self) -> list[dict[Any, Any]]:
-        every: Any = torch_optimizer
-        return [
-            self._optimizer._optimizer_step_pre_hooks,
-            self._optimizer._optimizer_step_post_hooks,
-            every._global_optimizer_pre_hooks,
-            every._global_optimizer_post_hooks,
-        ]
-
     def _watched(self) -> bool:
         """Whether somebody wants to see the steps, besides the controller and this package."""
-        pre, post, *everywhere = self._hooked()
+        pre, post, *everywhere = step_hooks(self._optimizer)
         own = (*pre.values(), *post.values())
         every = chain.from_iterable(hooks.values() for hooks in everywhere)
         return any(getattr(hook, "__self__", None) is not self._controller for hook in own) or any(

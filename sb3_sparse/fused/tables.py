@@ -238,4 +238,4 @@ class Tables:
             if stored is not None and stored.layer is not None and minimised.captured:
                 assert slot.layer is not None
                 dense = self._dense_grads[slot.layer].clone()
-                self._controller.note_gradient(stored.layer, dense.view(stored.layer.shape))
+                stored.layer.note_gradient(dense.view(stored.layer.shape))

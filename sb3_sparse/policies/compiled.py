@@ -7,10 +7,10 @@ from typing import TypeVar
 
 from torch import nn
 
+from sb3_sparse.engine.internals import WRAPPED
+
 Policy = TypeVar("Policy")
 Value = TypeVar("Value")
-
-WRAPPED = "_orig_mod"
 
 
 def unwrapped(policy: Policy) -> Policy:

@@ -12,6 +12,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, NatureCNN
 from stable_baselines3.common.type_aliases import Schedule
 
+from sb3_sparse.engine.internals import become
 from sb3_sparse.errors import MissingExtra, UnsupportedError
 from sb3_sparse.policies.acting import Actions
 from sb3_sparse.policies.actor_critic import SparseActorCriticPolicy
@@ -173,7 +174,7 @@ class SparseCrossQPolicy(SparseCriticsMixin, CrossQPolicy):
         super()._build(lr_schedule)
         for module in self.modules():
             if type(module) is BatchRenorm1d:
-                module.__class__ = SoundBatchRenorm1d
+                become(module, SoundBatchRenorm1d)
 
 
 SparseCrossQMlpPolicy = with_extractor(SparseCrossQPolicy, "Mlp", FlattenExtractor)

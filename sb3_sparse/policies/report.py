@@ -17,6 +17,7 @@ from torch import nn
 
 from sb3_sparse.engine.network import SparseNetwork
 from sb3_sparse.engine.prunable import Prunable
+from sb3_sparse.policies.internals import space_of
 from sb3_sparse.policies.spec import NetworkSpec
 
 SPARSE = "sparse"
@@ -245,7 +246,7 @@ def _conv_positions(policy: BasePolicy) -> dict[int, int]:
         with th.no_grad():
             observation = preprocess_obs(empty, space, normalize_images=policy.normalize_images)
             for module in policy.modules():
-                if isinstance(module, BaseFeaturesExtractor) and module._observation_space == space:
+                if isinstance(module, BaseFeaturesExtractor) and space_of(module) == space:
                     module.eval()(observation)
     finally:
         for handle in handles:

@@ -13,6 +13,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.save_util import load_from_zip_file
 
 from sb3_sparse.policies.compiled import plain_names
+from sb3_sparse.policies.internals import last_observations
 
 Algorithm = TypeVar("Algorithm", bound=BaseAlgorithm)
 
@@ -56,7 +57,7 @@ def was_normalised(model: BaseAlgorithm) -> bool:
     """
     if not isinstance(model, OnPolicyAlgorithm):
         return False
-    return differ(model._last_obs, model._last_original_obs)
+    return differ(*last_observations(model))
 
 
 def differ(seen: Any, raw: Any) -> bool:

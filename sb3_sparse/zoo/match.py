@@ -9,11 +9,11 @@ from typing import Any
 
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.preprocessing import is_image_space
 
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.policies.base import BaseSparsePolicy
+from sb3_sparse.policies.internals import no_schedule
 from sb3_sparse.policies.registry import SparsePolicy
 from sb3_sparse.sparsity.widths import equivalent_widths
 
@@ -92,7 +92,7 @@ def untrained_policy(
     if settings.get("use_sde"):
         kwargs["use_sde"] = True
     policy_class: Any = algorithm.policy_aliases[SparsePolicy]
-    policy = policy_class(observation_space, action_space, BasePolicy._dummy_schedule, **kwargs)
+    policy = policy_class(observation_space, action_space, no_schedule, **kwargs)
     assert isinstance(policy, BaseSparsePolicy)
     return policy
 

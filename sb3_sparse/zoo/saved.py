@@ -16,6 +16,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_sparse.errors import ConfigError, CorruptStateError
 from sb3_sparse.loading.guard import reading
 from sb3_sparse.loading.zips import check_state, look_into, read_model
+from sb3_sparse.policies.internals import COUNTERS, LAST_SEEN, wrapped
 from sb3_sparse.policies.registry import writers_of
 from sb3_sparse.policies.saving import differ
 from sb3_sparse.zoo.arguments import Kind, is_whole, kind_of
@@ -35,14 +36,8 @@ from sb3_sparse.zoo.folder import (
 from sb3_sparse.zoo.manager import load_for_prediction, loadable_algorithms, quiet
 from sb3_sparse.zoo.spec import algorithms
 
-COUNTED = (
-    "num_timesteps",
-    "_total_timesteps",
-    "_num_timesteps_at_start",
-    "_n_updates",
-    "_episode_num",
-)
-COUNTERS = Kind("a whole number, 0 or more", lambda v: is_whole(v) and v >= 0)
+COUNTED = ("num_timesteps", *COUNTERS)
+WHOLE = Kind("a whole number, 0 or more", lambda v: is_whole(v) and v >= 0)
 
 
 @dataclass(frozen=True)
@@ -102,7 +97,7 @@ class Saved:
         """
         try:
             with quiet():
-                seen = BaseAlgorithm._wrap_env(env, verbose=0, monitor_wrapper=False)
+                seen = wrapped(env)
             check_for_correct_spaces(seen, observations, actions)
         except (ValueError, AssertionError) as error:
             raise ConfigError(
@@ -120,7 +115,7 @@ def check_attributes(path: Path, algo: str, data: Mapping[str, Any]) -> None:
     :raises CorruptStateError: if so
     """
     for name, value in data.items():
-        kind = COUNTERS if name in COUNTED else kind_of(algo, name)
+        kind = WHOLE if name in COUNTED else kind_of(algo, name)
         plain = value is None or isinstance(value, (bool, int, float, str, list, dict))
         if kind is not None and plain and not kind.fits(value):
             raise CorruptStateError(
@@ -220,7 +215,7 @@ def _check_lone(path: Path, algo: str) -> None:
             )
     if issubclass(algorithms()[algo], OnPolicyAlgorithm):
         data, _ = read_model(path)
-        if differ(data.get("_last_obs"), data.get("_last_original_obs")):
+        if differ(*map(data.get, LAST_SEEN[:2])):
             raise ConfigError(
                 f"{path} was trained under a VecNormalize; give its statistics with --vecnormalize "
                 "FILE, also if it normalised rewards alone"

@@ -14,6 +14,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_sparse.policies.base import BaseSparsePolicy
 from sb3_sparse.policies.compiled import unwrapped
+from sb3_sparse.policies.internals import planned_timesteps, timesteps_since_start
 from sb3_sparse.zoo.computing import gradient_steps_of
 from sb3_sparse.zoo.match import Match
 
@@ -71,7 +72,7 @@ class TrainingLog(Watch):
             self.say(f"{what}, episodes: {planned}")
 
     def _on_training_start(self) -> None:
-        self.planned = self.model._total_timesteps
+        self.planned = planned_timesteps(self.model)
         self.tenths = 0
         policy = unwrapped(self.model.policy)
         if isinstance(policy, BaseSparsePolicy):
@@ -99,7 +100,7 @@ class TrainingLog(Watch):
         if isinstance(policy, BaseSparsePolicy):
             text += f", sparsity {policy.sparse.sparsity:.2%}"
         seconds = (time.time_ns() - self.model.start_time) / 1e9
-        done = self.model.num_timesteps - self.model._num_timesteps_at_start
+        done = timesteps_since_start(self.model)
         return f"{text}, {done / seconds:.0f} steps a second" if done else text
 
 

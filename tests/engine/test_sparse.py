@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from stable_baselines3.common.utils import polyak_update
 from torch import nn
 
-from sb3_sparse.engine.linear import SparseLinear, replace_data
+from sb3_sparse.engine.internals import replace_data
+from sb3_sparse.engine.linear import SparseLinear
 from sb3_sparse.engine.masked import MaskedStorage
 from sb3_sparse.engine.sparse import SparseStorage
 from sb3_sparse.errors import CorruptStateError, TopologyError, UnsupportedError

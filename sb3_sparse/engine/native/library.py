@@ -16,23 +16,28 @@ VERSION = 9
 """Of what the two sides hand each other; ``dispatch.c`` has the same."""
 
 
+def _integers(names: str) -> list[tuple[str, type[ctypes.c_int64]]]:
+    return [(name, ctypes.c_int64) for name in names.split()]
+
+
+class LayerArgument(ctypes.Structure):
+    """``layer_t`` of ``kernels.h``."""
+
+    _fields_ = [
+        *_integers("rows columns activation"),
+        ("a", ctypes.c_double),
+        ("b", ctypes.c_double),
+        *_integers("row_start column column_start row position value bias output"),
+        *_integers("value_grad bias_grad output_grad"),
+    ]
+
+
 class BatchArgument(ctypes.Structure):
     """``batch_t`` of ``kernels.h``."""
 
     _fields_ = [
-        (name, ctypes.c_int64)
-        for name in (
-            "layers",
-            "batch",
-            "threads",
-            "input",
-            "rows_in",
-            "rows_out",
-            "rows_grad",
-            "tiles_grad",
-            "rows_input_grad",
-            "tiles_input_grad",
-        )
+        *_integers("layers batch threads input rows_in rows_out"),
+        *_integers("rows_grad tiles_grad rows_input_grad tiles_input_grad"),
     ]
 
 
