@@ -39,7 +39,7 @@ from sb3_sparse.engine.native.library import in_use, instruction_sets, use
 from sb3_sparse.engine.products import TILE, tiles_of
 from sb3_sparse.engine.sequential import chain_up
 from sb3_sparse.engine.structure import Structure
-from sb3_sparse.sparsity.widths import equivalent_widths
+from sb3_sparse.sparsity import equivalent_widths
 
 Variant = tuple[Any, Callable[[], None], int]
 

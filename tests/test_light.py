@@ -170,7 +170,7 @@ def test_the_test_of_imports_sees_what_the_patching_module_does(tmp_path):
     assert {name.rpartition("Experiment")[2] for name in replaced} == {"Manager.objective"}
 
 
-@pytest.mark.parametrize("package", ["", ".studies", ".export", ".tuning"])
+@pytest.mark.parametrize("package", ["", ".algorithms", ".studies", ".export", ".tuning"])
 def test_names_that_are_imported_as_needed_are_no_modules(package):
     module = import_module(f"sb3_sparse{package}")
     modules = {one.name for one in iter_modules(module.__path__)}

@@ -1,1 +1,31 @@
-"""Gradient steps as programs that the kernels run in one call."""
+"""Gradient steps as programs that the kernels run in one call.
+
+A program is recorded once, by writing losses with values that stand for batches of numbers, and run
+for every gradient step. docs/gradient_steps.md shows an algorithm that records its own.
+"""
+
+from sb3_sparse.fused.distributions import (
+    bernoulli,
+    categorical,
+    gaussian,
+    least_of,
+    multi_categorical,
+    squashed_gaussian,
+)
+from sb3_sparse.fused.errors import NotCovered
+from sb3_sparse.fused.machine import Machine
+from sb3_sparse.fused.program import Program
+from sb3_sparse.fused.values import Value
+
+__all__ = [
+    "Machine",
+    "NotCovered",
+    "Program",
+    "Value",
+    "bernoulli",
+    "categorical",
+    "gaussian",
+    "least_of",
+    "multi_categorical",
+    "squashed_gaussian",
+]

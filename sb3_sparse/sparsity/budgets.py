@@ -9,19 +9,15 @@ from sb3_sparse.sparsity.distributions import check_sparsity
 from sb3_sparse.sparsity.numeric import is_number
 
 
-def default_actor_share(actor_size: int, critics_size: int) -> float:
-    """Share of the actor at which actor and critics are equally sparse.
-
-    :param actor_size: connections of the dense actor
-    :param critics_size: connections of all dense critics together
-    """
-    return actor_size / (actor_size + critics_size)
-
-
 def feasible_actor_share(
     actor_size: int, critics_size: int, sparsity: float
 ) -> tuple[float, float]:
-    """Smallest and largest actor share for which no network would need more than all it has."""
+    """Smallest and largest actor share at which no network would get more than it has.
+
+    :param actor_size: connections of the dense actor
+    :param critics_size: connections of all dense critics together
+    :param sparsity: removed fraction over actor and critics together, in [0, 1)
+    """
     budget = (1.0 - sparsity) * (actor_size + critics_size)
     return max(0.0, 1.0 - critics_size / budget), min(1.0, actor_size / budget)
 
@@ -40,6 +36,8 @@ def split_sparsity(
     actor_size: int, critics_size: int, sparsity: float, actor_share: float
 ) -> tuple[float, float]:
     """Sparsity of the actor and of each critic for one common budget.
+
+    Both are equally sparse at ``actor_share = actor_size / (actor_size + critics_size)``.
 
     :param actor_size: connections of the dense actor
     :param critics_size: connections of all dense critics together (two critics count twice)

@@ -9,11 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sb3_sparse.errors import ConfigError
-from sb3_sparse.sparsity.budgets import (
-    default_actor_share,
-    feasible_actor_share,
-    split_sparsity,
-)
+from sb3_sparse.sparsity import feasible_actor_share, split_sparsity
 
 ACTOR = 17 * 256 + 256 * 256 + 256 * (6 + 6)  # 72960
 CRITICS = 2 * (23 * 256 + 256 * 256 + 256 * 1)  # 143360
@@ -22,14 +18,8 @@ sizes = st.integers(1, 10**7)
 sparsities = st.integers(0, 99).map(lambda k: k / 100)
 
 
-def test_default_share_of_halfcheetah_sac_is_34_to_66():
-    share = default_actor_share(ACTOR, CRITICS)
-    assert round(100 * share) == 34
-    assert share == pytest.approx(72960 / 216320, rel=1e-12)
-
-
 @pytest.mark.parametrize("sparsity", [0.0, 0.5, 0.9, 0.99])
-def test_at_the_default_share_actor_and_critics_are_equally_sparse(sparsity):
+def test_at_the_share_of_its_size_actor_and_critics_are_equally_sparse(sparsity):
     actor, critic = split_sparsity(ACTOR, CRITICS, sparsity, 72960 / 216320)
     assert actor == pytest.approx(sparsity, abs=1e-12)
     assert critic == pytest.approx(sparsity, abs=1e-12)
