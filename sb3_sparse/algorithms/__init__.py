@@ -1,6 +1,6 @@
 """SB3's algorithms with gradient steps that run in one call of the kernels.
 
-``OffPolicy`` and ``OnPolicy`` are the bases for algorithms of your own (docs/gradient_steps.md).
+Subclass one of them for an algorithm of your own (docs/gradient_steps.md).
 """
 
 from __future__ import annotations
@@ -13,32 +13,10 @@ from sb3_sparse.lazy import lazily
 if TYPE_CHECKING:
     from sb3_sparse.algorithms.a2c import A2C
     from sb3_sparse.algorithms.dqn import DQN
-    from sb3_sparse.algorithms.off_policy import OffPolicy, Transitions
-    from sb3_sparse.algorithms.on_policy import OnPolicy
     from sb3_sparse.algorithms.ppo import PPO
     from sb3_sparse.algorithms.sac import SAC
     from sb3_sparse.algorithms.td3 import DDPG, TD3
     from sb3_sparse.algorithms.training import parts
 
-__all__ = [
-    "A2C",
-    "DDPG",
-    "DQN",
-    "PPO",
-    "SAC",
-    "TD3",
-    "OffPolicy",
-    "OnPolicy",
-    "Transitions",
-    "parts",
-]
-__getattr__, __dir__ = lazily(
-    __name__,
-    {
-        **HOMES,
-        "OffPolicy": "off_policy",
-        "OnPolicy": "on_policy",
-        "Transitions": "off_policy",
-        "parts": "training",
-    },
-)
+__all__ = ["A2C", "DDPG", "DQN", "PPO", "SAC", "TD3", "parts"]
+__getattr__, __dir__ = lazily(__name__, {**HOMES, "parts": "training"})

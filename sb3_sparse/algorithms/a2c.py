@@ -12,7 +12,16 @@ from sb3_sparse.fused.program import Program
 
 
 class A2C(OnPolicy, stable_baselines3.A2C):
-    """Stable-Baselines3's A2C; each gradient step of a sparse policy is one call of the kernels."""
+    """Stable-Baselines3's A2C with fused gradient steps, if the policy is sparse.
+
+    Example::
+
+        from sb3_sparse import A2C, SparsityCallback
+
+        model = A2C("SparsePolicy", "CartPole-v1", policy_kwargs=dict(sparsity=0.9))
+        model.why_not_fused()  # None: each gradient step is one call of the kernels
+        model.learn(200, callback=SparsityCallback("rigl", update_interval=10))
+    """
 
     def _next_machine(self) -> Machine:
         self._trains().begin(self, METHODS)
@@ -21,7 +30,7 @@ class A2C(OnPolicy, stable_baselines3.A2C):
         return self._trains().machine(key, batch, [self.policy.optimizer], self._record)
 
     def _record(self, program: Program) -> None:
-        """One gradient step."""
+        """Record one gradient step."""
         values, log_prob, entropy = self._record_policy(program)
         advantages = program.input("advantages", 1)
         if self.normalize_advantage:

@@ -16,7 +16,16 @@ METHODS: dict[str, tuple[str, ...]] = {
 
 
 class DQN(OffPolicy, stable_baselines3.DQN):
-    """Stable-Baselines3's DQN; each gradient step of a sparse policy is one call of the kernels."""
+    """Stable-Baselines3's DQN with fused gradient steps, if the policy is sparse.
+
+    Example::
+
+        from sb3_sparse import DQN, SparsityCallback
+
+        model = DQN("SparsePolicy", "CartPole-v1", policy_kwargs=dict(sparsity=0.9))
+        model.why_not_fused()  # None: each gradient step is one call of the kernels
+        model.learn(200, callback=SparsityCallback("rigl", update_interval=10))
+    """
 
     def _next_machine(self) -> Machine:
         self._trains().begin(self, METHODS)
@@ -29,7 +38,7 @@ class DQN(OffPolicy, stable_baselines3.DQN):
         )  # fmt: skip
 
     def _record(self, program: Program, source: str) -> None:
-        """One gradient step."""
+        """Record one gradient step."""
         batch = self._record_transitions(program, source, self.q_net.features_dim, 1)
         next_q = program.network(parts(self.q_net_target.q_net), batch.next_obs).max_features()
         target_q = batch.rewards + batch.not_done * batch.discounts * next_q

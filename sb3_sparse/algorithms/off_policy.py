@@ -1,4 +1,4 @@
-"""What SAC, TD3, DDPG and DQN have in common: batches of a replay buffer."""
+"""Base class of SAC, TD3, DDPG and DQN: batches of a replay buffer."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from sb3_sparse.fused.values import Value
 from sb3_sparse.policies.shortcut import takes_vectors
 
 IN_PLACE, SAMPLED, N_STEP = "in place", "sampled", "n-step"
-"""Ways to read a replay buffer: its arrays, or what its own ``sample`` gives."""
+"""Ways to read a replay buffer: its arrays in place, or batches from its own ``sample``."""
 
 
 class Transitions(NamedTuple):
@@ -29,18 +29,21 @@ class Transitions(NamedTuple):
     actions: Value
     rewards: Value
     not_done: Value
-    """0 where the episode has ended, else 1."""
+    """0.0 where the episode has ended, else 1.0."""
     discounts: Value
 
 
 class OffPolicy(Fused, OffPolicyAlgorithm):
-    """An algorithm that learns from a replay buffer."""
+    """Base class of algorithms that learn from a replay buffer by fused gradient steps.
+
+    A subclass defines ``_record`` and ``_train_fused``; docs/gradient_steps.md has an example.
+    """
 
     _machine: Callable[..., Machine]
-    """What runs the next gradient step, by batch size, source and details of the algorithm."""
+    """Gives the machine for a batch size, a source and details of the algorithm."""
 
     def _find_source(self) -> str:
-        """How to read the replay buffer."""
+        """Choose how to read the replay buffer."""
         buffer = self.replay_buffer
         if (
             type(buffer) is ReplayBuffer
@@ -56,14 +59,15 @@ class OffPolicy(Fused, OffPolicyAlgorithm):
     def _record_transitions(
         program: Program, source: str, observations: int, actions: int
     ) -> Transitions:
-        """The inputs of a program.
+        """Declare the inputs of a program.
 
+        :param program: the program
         :param source: how the replay buffer is read
         :param observations: features of an observation
-        :param actions: numbers of an action
+        :param actions: numbers in an action
         """
         dones = program.input("dones", 1)
-        if source == IN_PLACE:  # an episode that was cut off goes on
+        if source == IN_PLACE:  # a truncated episode has not ended
             dones = dones * (1.0 - program.input("timeouts", 1))
         return Transitions(
             program.input("obs", observations),
@@ -75,11 +79,12 @@ class OffPolicy(Fused, OffPolicyAlgorithm):
         )
 
     def _next_batch(self, batch: int, source: str, *details: Any) -> tuple[Machine, Any]:
-        """Draw a batch, of the same random numbers as SB3, and hand it over.
+        """Draw a batch by the same random numbers as SB3, and set it as input.
 
-        :param details: what else the program depends on, as ``_machine`` takes it
-        :return: the machine that has it, and what the buffer's ``sample`` gave; None if it was not
-            asked
+        :param batch: batch size
+        :param source: how to read the replay buffer
+        :param details: further arguments of ``_machine``
+        :return: the machine, and what the buffer's ``sample`` returned; None if it is read in place
         """
         machine = self._machine(batch, source, *details)  # before anything is drawn
         buffer: Any = self.replay_buffer
@@ -104,10 +109,10 @@ class OffPolicy(Fused, OffPolicyAlgorithm):
         return machine, data
 
     def _observations(self, machine: Machine, data: Any, next_ones: bool) -> th.Tensor:
-        """Those of the batch at hand, as SB3's buffer gives them.
+        """Give the observations of the present batch in the form of SB3's buffer.
 
-        :param data: what the buffer's ``sample`` gave; None if it was not asked
-        :param next_ones: whether those after the step
+        :param data: what the buffer's ``sample`` returned; None if it is read in place
+        :param next_ones: whether to give the observations after the step
         """
         if data is not None:
             found: th.Tensor = data.next_observations if next_ones else data.observations
@@ -121,7 +126,7 @@ class OffPolicy(Fused, OffPolicyAlgorithm):
 
     @staticmethod
     def _point(machine: Machine, buffer: ReplayBuffer, batch: int) -> None:
-        """As ``ReplayBuffer.sample``, but the kernels read the rows themselves."""
+        """Draw rows as ``ReplayBuffer.sample`` does, for the kernels to read in place."""
         size, count = buffer.buffer_size, buffer.n_envs
         if buffer.optimize_memory_usage and buffer.full:
             rows = (np.random.randint(1, size, size=batch) + buffer.pos) % size

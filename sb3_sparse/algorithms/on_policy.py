@@ -1,4 +1,4 @@
-"""What PPO and A2C have in common."""
+"""Base class of PPO and A2C: minibatches of a rollout."""
 
 from __future__ import annotations
 
@@ -41,15 +41,15 @@ ARRAYS = {
     "advantages": "advantages",
     "returns": "returns",
 }
-"""Where a rollout buffer has the inputs of a program."""
+"""The arrays of a rollout buffer by the names of a program's inputs."""
 
 
 class Minibatch(NamedTuple):
-    """A part of a rollout.
+    """A minibatch of a rollout.
 
-    :param size: of its batch
-    :param data: what the rollout buffer gives; None: programs read its arrays
-    :param rows: numbers of their rows, if so
+    :param size: batch size
+    :param data: what the rollout buffer returned; None: programs read its arrays
+    :param rows: row numbers in these arrays
     """
 
     size: int
@@ -58,10 +58,13 @@ class Minibatch(NamedTuple):
 
 
 class OnPolicy(Fused, OnPolicyAlgorithm):
-    """An algorithm that learns from rollouts."""
+    """Base class of algorithms that learn from rollouts by fused gradient steps.
+
+    A subclass defines ``_record`` and ``_train_fused``, as PPO does.
+    """
 
     def _record_policy(self, program: Program) -> tuple[Value, Value, Value]:
-        """Values, log probabilities and entropy of a batch of observations and actions."""
+        """Record values, log probabilities and entropy of a batch of observations and actions."""
         policy: Any = self.policy
         both = policy.mlp_extractor
         obs = program.input("obs", policy.features_dim)
@@ -71,7 +74,7 @@ class OnPolicy(Fused, OnPolicyAlgorithm):
         space = self.action_space
         if isinstance(space, spaces.Box):
             log_std = program.parameter(policy.log_std)
-            # There is no Gaussian of deviation 0.
+            # A Gaussian needs a deviation above 0.
             program.check(program.constant(0.0) / log_std.exp(), "distribution")
             actions = program.input("actions", head.features)
             log_prob, entropy = gaussian(head, log_std, actions)
@@ -86,13 +89,13 @@ class OnPolicy(Fused, OnPolicyAlgorithm):
         else:
             raise NotCovered(f"actions of type {type(space).__name__}")
         if isinstance(space, spaces.Discrete | spaces.MultiDiscrete):
-            program.check(log_prob, "distribution")  # of infinite logits
+            program.check(log_prob, "distribution")  # for infinite logits
         return values, log_prob, entropy
 
     def _minimise(
         self, program: Program, policy_loss: Value, values: Value, entropy: Value
     ) -> None:
-        """Take a step down the losses of policy, value network and entropy together."""
+        """Record the total loss of policy, value network and entropy, and the step."""
         value_loss = (program.input("returns", 1) - values).square().mean()
         entropy_loss = -(entropy.mean() if entropy.batched else entropy)
         loss = (
@@ -107,7 +110,7 @@ class OnPolicy(Fused, OnPolicyAlgorithm):
         program.minimise(loss, self.policy.optimizer, clip=program.scalar("max_grad_norm"))
 
     def _coefficients(self) -> dict[str, float]:
-        """The numbers of :meth:`_minimise`."""
+        """Give the coefficients that :meth:`_minimise` uses."""
         return {name: getattr(self, name) for name in ("ent_coef", "vf_coef", "max_grad_norm")}
 
     @staticmethod
@@ -163,7 +166,7 @@ class OnPolicy(Fused, OnPolicyAlgorithm):
         )
 
     def _refuse(self, part: Minibatch, check: str) -> None:
-        """Let SB3's distribution say what it does not take: means that are not finite, say."""
+        """Let SB3's distribution raise its error, for means that are not finite say."""
         data, buffer = part.data, self.rollout_buffer
         if data is None:
             data = samples(buffer, part.rows)

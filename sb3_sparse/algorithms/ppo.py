@@ -25,11 +25,20 @@ TITLES = (
     "train/approx_kl",
     "train/clip_fraction",
 )
-"""In SB3's order, in which writers of logs get them."""
+"""Logged values in SB3's order."""
 
 
 class PPO(OnPolicy, stable_baselines3.PPO):
-    """Stable-Baselines3's PPO; each gradient step of a sparse policy is one call of the kernels."""
+    """Stable-Baselines3's PPO with fused gradient steps, if the policy is sparse.
+
+    Example::
+
+        from sb3_sparse import PPO, SparsityCallback
+
+        model = PPO("SparsePolicy", "CartPole-v1", policy_kwargs=dict(sparsity=0.9), n_steps=64)
+        model.why_not_fused()  # None: each gradient step is one call of the kernels
+        model.learn(200, callback=SparsityCallback("rigl", update_interval=10))
+    """
 
     def _next_machine(self) -> Machine:
         self._trains().begin(self, METHODS)
@@ -45,7 +54,7 @@ class PPO(OnPolicy, stable_baselines3.PPO):
         )  # fmt: skip
 
     def _record(self, program: Program, normalised: bool, clipped: bool) -> None:
-        """One gradient step."""
+        """Record one gradient step."""
         values, log_prob, entropy = self._record_policy(program)
         advantages = program.input("advantages", 1)
         if normalised:

@@ -25,16 +25,25 @@ METHODS: dict[str, tuple[str, ...]] = {
 
 
 class SAC(OffPolicy, stable_baselines3.SAC):
-    """Stable-Baselines3's SAC; each gradient step of a sparse policy is one call of the kernels."""
+    """Stable-Baselines3's SAC with fused gradient steps, if the policy is sparse.
+
+    Example::
+
+        from sb3_sparse import SAC, SparsityCallback
+
+        model = SAC("SparsePolicy", "Pendulum-v1", policy_kwargs=dict(sparsity=0.9))
+        model.why_not_fused()  # None: each gradient step is one call of the kernels
+        model.learn(200, callback=SparsityCallback("rigl", update_interval=10))
+    """
 
     def _optimizers(self) -> list[th.optim.Optimizer]:
         optimizers = [self.actor.optimizer, self.critic.optimizer]
         return optimizers + ([self.ent_coef_optimizer] if self.ent_coef_optimizer else [])
 
     def _begin(self) -> None:
-        """Look at the model before a round of gradient steps.
+        """Inspect the model before a round of gradient steps.
 
-        :raises NotCovered: if they are SB3's own
+        :raises NotCovered: if SB3 must take them
         """
         own = () if self.log_ent_coef is None else (self.log_ent_coef,)
         self._trains().begin(self, METHODS, own)
@@ -52,7 +61,7 @@ class SAC(OffPolicy, stable_baselines3.SAC):
         )  # fmt: skip
 
     def _record(self, program: Program, source: str) -> None:
-        """One gradient step."""
+        """Record one gradient step."""
         actor: Any = self.actor
         critic, target = self.critic, self.critic_target
         dim = int(np.prod(self.action_space.shape or ()))
@@ -131,7 +140,7 @@ class SAC(OffPolicy, stable_baselines3.SAC):
                 self.logger.record(f"train/{name}", mean(logged[name]))
 
     def _refuse(self, machine: Machine, data: Any, noise: str) -> None:
-        """Let SB3's distribution say what it does not take: means that are not finite, say."""
+        """Let SB3's distribution raise its error, for means that are not finite say."""
         obs = self._observations(machine, data, next_ones=noise == "next_noise")
         with th.no_grad(), th.random.fork_rng(devices=[]):
             self.actor.action_log_prob(obs)

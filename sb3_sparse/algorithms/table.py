@@ -1,4 +1,4 @@
-"""Which class trains an algorithm."""
+"""The classes that train each algorithm."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ if TYPE_CHECKING:  # which is imported when an algorithm is, not when one is nam
     from stable_baselines3.common.base_class import BaseAlgorithm
 
 HOMES = {"A2C": "a2c", "DDPG": "td3", "DQN": "dqn", "PPO": "ppo", "SAC": "sac", "TD3": "td3"}
-"""Modules of this package by the name of the algorithm whose class they have."""
+"""The module of each algorithm that this package has a class for."""
 
 
 def algorithm_named(name: str) -> type[BaseAlgorithm]:
-    """The class of an algorithm: this package's where it has one, else sb3-contrib's.
+    """Find the class of an algorithm: this package's if it has one, else sb3-contrib's.
 
     :param name: one of :func:`~sb3_sparse.policies.registry.algorithm_names`
     """
@@ -28,9 +28,9 @@ def algorithm_named(name: str) -> type[BaseAlgorithm]:
 
 
 def trainer_of(algorithm: type[BaseAlgorithm]) -> type:
-    """The class whose ``train()`` an algorithm runs; for this package's, SB3's that it equals.
+    """Find the class that defines an algorithm's ``train()``; for this package's, SB3's class.
 
-    :param algorithm: any class of an algorithm, a user's own too
+    :param algorithm: any algorithm class, including a user's own
     """
     return next(
         (

@@ -22,12 +22,21 @@ METHODS: dict[str, tuple[str, ...]] = {
 
 
 class TD3(OffPolicy, stable_baselines3.TD3):
-    """Stable-Baselines3's TD3; each gradient step of a sparse policy is one call of the kernels."""
+    """Stable-Baselines3's TD3 with fused gradient steps, if the policy is sparse.
+
+    Example::
+
+        from sb3_sparse import TD3, SparsityCallback
+
+        model = TD3("SparsePolicy", "Pendulum-v1", policy_kwargs=dict(sparsity=0.9))
+        model.why_not_fused()  # None: each gradient step is one call of the kernels
+        model.learn(200, callback=SparsityCallback("rigl", update_interval=10))
+    """
 
     def _begin(self) -> None:
-        """Look at the model before a round of gradient steps.
+        """Inspect the model before a round of gradient steps.
 
-        :raises NotCovered: if they are SB3's own
+        :raises NotCovered: if SB3 must take them
         """
         self._trains().begin(self, METHODS)
         if self.tau >= 1:
@@ -100,4 +109,13 @@ class TD3(OffPolicy, stable_baselines3.TD3):
 
 
 class DDPG(TD3, stable_baselines3.DDPG):
-    """Stable-Baselines3's DDPG; its gradient steps are those of :class:`TD3`."""
+    """Stable-Baselines3's DDPG with fused gradient steps, those of :class:`TD3`.
+
+    Example::
+
+        from sb3_sparse import DDPG, SparsityCallback
+
+        model = DDPG("SparsePolicy", "Pendulum-v1", policy_kwargs=dict(sparsity=0.9))
+        model.why_not_fused()  # None: each gradient step is one call of the kernels
+        model.learn(200, callback=SparsityCallback("rigl", update_interval=10))
+    """

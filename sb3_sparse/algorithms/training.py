@@ -1,4 +1,4 @@
-"""What the algorithms have in common: whether their gradient steps can be fused, and how."""
+"""Base class of all algorithms: decides whether gradient steps can be fused, and runs them."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ Build = Callable[[Program], None]
 
 
 class Training:
-    """The machines of a model. Copies and pickles begin without any."""
+    """Owns the machines of a model. Copies and pickles start without any."""
 
     def __init__(self) -> None:
         self._machines: dict[Hashable, Machine] = {}
@@ -52,9 +52,9 @@ class Training:
         self._policy: Any = None
         self._prepared: Machine | None = None
         self.reason: str | None = None
-        """Why the last gradient steps were SB3's own; None: they were fused."""
+        """Reason why SB3 took the last gradient steps; None: they were fused."""
         self.said: set[str] = set()
-        """Reasons that the log has told."""
+        """Reasons that have been logged."""
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Training:
         return Training()
@@ -68,12 +68,13 @@ class Training:
         methods: dict[str, tuple[str, ...]],
         others: Sequence[th.Tensor] = (),
     ) -> None:
-        """Look at the policy of a model before a round of gradient steps.
+        """Inspect the policy of a model before a round of gradient steps.
 
-        :param methods: by the dotted name of a module ("": the policy), those that SB3's
-            ``train()`` calls
-        :param others: parameters that are trained beside the policy's
-        :raises NotCovered: if somebody would notice, or miss, that SB3 does not call them
+        :param model: the model
+        :param methods: the methods that SB3's ``train()`` calls, by the dotted name of their module
+            ("": the policy)
+        :param others: parameters that are trained besides the policy's
+        :raises NotCovered: if skipping these methods would change the result
         """
         policy = model.policy
         if unwrapped(policy) is not policy:
@@ -110,11 +111,11 @@ class Training:
         if th.is_autocast_enabled("cpu") or th.is_anomaly_enabled():
             raise NotCovered("autocast or anomaly detection")
         for tensor in tensors:
-            tensor.grad = None  # as SB3's steps begin
+            tensor.grad = None  # as at the start of SB3's steps
         self._policy, self._prepared = policy, None
 
     def _settings_now(self) -> list[Any]:
-        """What can change without a module, a tensor or a name that comes or goes."""
+        """Collect what may change while modules, tensors and attributes stay the same."""
         distributions = [attributes["action_dist"] for attributes in self._acting]
         return [*map(number_of, self._adjustable), *distributions, *map(type, distributions)]
 
@@ -125,11 +126,11 @@ class Training:
         optimizers: Sequence[th.optim.Optimizer],
         build: Build,
     ) -> Machine:
-        """What runs the next gradient step.
+        """Give the machine for the next gradient step.
 
-        :param key: what a program depends on beside policy and optimizers
-        :param batch: the largest there will be
-        :param optimizers: those that will take a step
+        :param key: what the program depends on besides policy and optimizers
+        :param batch: maximum batch size
+        :param optimizers: the optimizers that take a step
         :param build: records the program
         :raises NotCovered: if programs cannot compute it
         """
@@ -185,9 +186,16 @@ def _trained(policy: BaseSparsePolicy) -> Iterable[th.Tensor]:
 
 
 def parts(*modules: nn.Module) -> Parts:
-    """Linear layers and activations of a network.
+    """Split a network into linear layers and activations, for ``program.network``.
 
-    :raises NotCovered: if there is anything else in it
+    Example::
+
+        from torch import nn
+        from sb3_sparse.algorithms import parts
+
+        parts(nn.Linear(3, 8), nn.ReLU(), nn.Linear(8, 1))  # two layers, one with an activation
+
+    :raises NotCovered: if it has any other module
     """
     found = parts_of(modules)
     if found is None:
@@ -198,9 +206,11 @@ def parts(*modules: nn.Module) -> Parts:
 
 
 def features(policy: BasePolicy, obs: Any) -> th.Tensor:
-    """Observations as the networks get them, in numbers that programs read.
+    """Convert observations of a buffer to the input of the networks, in a type programs read.
 
-    :param obs: of a buffer, shape ``(batch, *shape)``
+    :param policy: the policy
+    :param obs: shape ``(batch, *shape)``
+    :raises NotCovered: for dict observations
     """
     if not isinstance(obs, th.Tensor):
         raise NotCovered("dict observations")
@@ -212,14 +222,12 @@ def features(policy: BasePolicy, obs: Any) -> th.Tensor:
 
 
 def mean(numbers: Sequence[float]) -> Any:
-    """As ``np.mean``; of one number, as there is where each step is followed by a gradient step,
-    that one.
-    """
+    """Average as ``np.mean`` does, but faster for a single number."""
     return np.float64(numbers[0]) if len(numbers) == 1 else np.mean(numbers)
 
 
 class Fused(BaseAlgorithm):
-    """An algorithm whose gradient steps run in one call of the kernels where they can."""
+    """Base class of algorithms whose gradient steps run in one call of the kernels if possible."""
 
     _training: Training
 
@@ -227,7 +235,7 @@ class Fused(BaseAlgorithm):
         self._check_policy_class()
         super()._setup_model()  # type: ignore[safe-super]
         if isinstance(self.policy, BaseSparsePolicy):
-            self.policy.use_kernels()  # also where it has no zeros, and so would stay stock SB3's
+            self.policy.use_kernels()  # also at sparsity 0, where the policy would stay SB3's
 
     def _check_policy_class(self) -> None:
         """Reject policies of other algorithms, of a file that another one saved, say.
@@ -255,15 +263,15 @@ class Fused(BaseAlgorithm):
 
     @abstractmethod
     def _next_machine(self) -> Machine:
-        """What would run the next gradient step.
+        """Give the machine for the next gradient step.
 
         :raises NotCovered: if programs cannot compute it
         """
 
     def train(self, *args: Any, **kwargs: Any) -> None:
-        """As in SB3, with the arguments that the algorithm's ``train`` has there.
+        """Train as SB3 does, with the arguments of the algorithm's ``train`` there.
 
-        What programs do not cover, such as images or gSDE, SB3 trains.
+        SB3 takes the gradient steps that programs do not cover, such as those of images or gSDE.
         """
         try:
             self._train_fused(*args, **kwargs)
@@ -273,18 +281,22 @@ class Fused(BaseAlgorithm):
 
     @abstractmethod
     def _train_fused(self, *args: Any, **kwargs: Any) -> None:
-        """A round of gradient steps.
+        """Take a round of gradient steps.
 
-        :raises NotCovered: before it has begun, if programs do not cover them
+        :raises NotCovered: before the first, if programs do not cover them
         """
 
     def why_not_fused(self) -> str | None:
-        """Why gradient steps are Stable-Baselines3's own; None: they are fused.
+        """Tell why gradient steps are Stable-Baselines3's own; None: they are fused.
 
-        It is found out by recording one, as the model is now, without running it: some
-        milliseconds, once. ::
+        This records a step of the present model without running it, which takes milliseconds.
 
-            model = SAC("SparsePolicy", env, use_sde=True, policy_kwargs=dict(sparsity=0.9))
+        Example::
+
+            from sb3_sparse import SAC
+
+            kwargs = dict(sparsity=0.9)
+            model = SAC("SparsePolicy", "Pendulum-v1", policy_kwargs=kwargs, use_sde=True)
             model.why_not_fused()  # 'gSDE'
         """
         try:
@@ -294,7 +306,7 @@ class Fused(BaseAlgorithm):
         return None
 
     def _not_covered(self, why: NotCovered) -> None:
-        """Let the log say once why gradient steps are SB3's own, where the policy is sparse."""
+        """Log once why gradient steps are SB3's own, if the policy is sparse."""
         training = self._trains()
         training.reason = reason = why.reason
         if reason not in training.said:

@@ -1,4 +1,4 @@
-"""Activations that the kernels know."""
+"""Activations that the kernels compute."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ ACTIVATIONS: dict[type[nn.Module], Activation] = {
     nn.Hardtanh: lambda m: (13, m.min_val, m.max_val),
     nn.Hardswish: lambda _: (14, 0.0, 0.0),
 }
-"""Number and parameters of an activation in ``kernels.h``."""
+"""Gives the number and the parameters of an activation in ``kernels.h``."""
 
 ADJUSTABLE = (nn.ELU, nn.CELU, nn.GELU, nn.Softplus, nn.LeakyReLU, nn.Hardtanh)
-"""Those with parameters, which may be set anew."""
+"""Activations with parameters, which the user may change."""
 _WITH_SLOPE: dict[type[nn.Module], Callable[[Any], bool]] = {
     nn.ReLU: lambda _: True,
     nn.Tanh: lambda _: True,
@@ -42,11 +42,11 @@ _WITH_SLOPE: dict[type[nn.Module], Callable[[Any], bool]] = {
 
 
 def tells_its_slope(module: nn.Module) -> bool:
-    """Whether the slope follows from the result alone, as the kernels' way back needs it."""
+    """Whether the slope follows from the result alone, as the kernels' backward pass needs it."""
     tells = _WITH_SLOPE.get(type(module))
     return tells is not None and tells(module)
 
 
 def number_of(module: nn.Module | None) -> tuple[int, float, float]:
-    """Number and parameters of an activation in ``kernels.h``; None: nothing follows."""
+    """Give the number and the parameters of an activation in ``kernels.h``; None: the identity."""
     return (0, 0.0, 0.0) if module is None else ACTIVATIONS[type(module)](module)

@@ -1,4 +1,4 @@
-"""Which linear layers store and compute their active connections only: ``compute="auto"``.
+"""The rule of ``compute="auto"``: which linear layers get sparse storage.
 
 The rule goes by shapes, counts and the kernels' instruction set, so equal seeds give equal runs on
 a machine. A chain of layers with nothing but activations between them is one decision, because
@@ -19,17 +19,17 @@ from sb3_sparse.engine.sequential import ELEMENTWISE
 from sb3_sparse.engine.storage import LayerStorage
 
 LARGE = 2**13
-"""Connections of a dense layer below which overhead decides."""
+"""Size of a layer below which overhead dominates."""
 HUGE = 2**18
-"""Connections of a dense layer beyond which dense products are at their best."""
+"""Size of a layer above which dense products are at their best."""
 WITH_VECTORS = ("avx512", "avx2")
-"""Instruction sets whose kernels keep up with dense products of some density."""
+"""Instruction sets whose kernels compete with dense products at up to half the connections."""
 
 
 class AutoCompute:
     """Applies the rule when a policy is built, and again after pruning has removed connections.
 
-    :param allowed: names of the layers that may be stored as their active connections only
+    :param allowed: names of the layers that may get sparse storage
     """
 
     def __init__(self, allowed: Container[str]) -> None:
@@ -42,11 +42,12 @@ class AutoCompute:
         layers: Sequence[LayerStorage],
         optimizers: Iterable[th.optim.Optimizer],
     ) -> list[str]:
-        """Names of the layers to store as sparse; none if nothing has changed.
+        """Choose the layers to store as sparse; none if no connection was removed since.
 
         :param root: the policy
-        :param layers: its sparse layers
-        :param optimizers: what moves them
+        :param layers: its layers within the budget
+        :param optimizers: the optimizers that own them
+        :return: names
         """
         nnz = sum(layer.nnz for layer in layers)
         if nnz == self._nnz:
@@ -62,11 +63,12 @@ class AutoCompute:
 
 
 def choose(root: nn.Module, layers: Iterable[LayerStorage], allowed: Container[str]) -> list[str]:
-    """Names of the layers to store as sparse.
+    """Choose the layers to store as sparse.
 
     :param root: the policy
-    :param layers: its sparse layers
-    :param allowed: names of those that may be stored so
+    :param layers: its layers within the budget
+    :param allowed: names of the layers that may get sparse storage
+    :return: names
     """
     if why_missing() is not None:
         return []
@@ -79,19 +81,19 @@ def choose(root: nn.Module, layers: Iterable[LayerStorage], allowed: Container[s
 
 
 def pays(size: int, nnz: int) -> bool:
-    """Whether a layer gains so much from sparse storage that its chain should have it.
+    """Whether one layer gains enough for its whole chain to become sparse.
 
     :param size: connections of the dense layer
-    :param nnz: active ones
+    :param nnz: active connections
     """
     return size >= LARGE and sparse_enough(size, nnz)
 
 
 def sparse_enough(size: int, nnz: int) -> bool:
-    """Whether products with the active connections of a layer are quicker than dense ones.
+    """Whether products with the active connections of a layer are faster than dense ones.
 
     :param size: connections of the dense layer
-    :param nnz: active ones
+    :param nnz: active connections
     """
     if in_use() not in WITH_VECTORS:
         return nnz <= size / 4
@@ -99,7 +101,7 @@ def sparse_enough(size: int, nnz: int) -> bool:
 
 
 def chains_of(root: nn.Module, layers: Iterable[LayerStorage]) -> list[list[LayerStorage]]:
-    """Linear layers in groups that follow each other with nothing but activations between."""
+    """Group linear layers that follow each other with nothing but activations between them."""
     linear = {id(layer.module): layer for layer in layers if isinstance(layer.module, nn.Linear)}
     chains: list[list[LayerStorage]] = []
     seen: set[int] = set()

@@ -1,4 +1,4 @@
-"""Actions within their bounds, and between these and [-1, 1], in one call of the kernels each."""
+"""Clips and scales actions, in one call of the kernels each."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ CLIP, UNSCALE, SCALE = range(3)
 
 
 class Bounds:
-    """Lowest and highest actions, ready for the kernels. A copy or pickle of it is None.
+    """Lowest and highest actions, ready for the kernels. Copies and pickles of it are None.
 
     :param low: lowest actions, float32
     :param high: highest actions, float32, of the same shape
@@ -31,16 +31,16 @@ class Bounds:
 
     @staticmethod
     def readable(low: Array, high: Array) -> bool:
-        """Whether the kernels can read them."""
+        """Whether the kernels can read these bounds."""
         return all(
             bound.dtype == FLOAT and bound.flags.c_contiguous and bound.shape == low.shape
             for bound in (low, high)
         )
 
     def of(self, actions: Array, how: int) -> Array | None:
-        """New actions, as NumPy computes them; None for those that are no float32 of that shape.
+        """Clip or scale actions as NumPy would; None unless they are float32 of the right shape.
 
-        :param actions: one, or shape ``(n, *shape of one)``
+        :param actions: one action, or shape ``(n, *shape of one)``
         :param how: ``CLIP`` to the bounds; ``UNSCALE`` from [-1, 1] to them; ``SCALE`` back
         """
         shape = actions.shape

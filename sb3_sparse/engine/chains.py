@@ -1,4 +1,4 @@
-"""Chains of sparse linear layers: one call of the kernels forward, one backward."""
+"""Chains of sparse linear layers: one call of the kernels for each forward or backward pass."""
 
 from __future__ import annotations
 
@@ -18,24 +18,25 @@ PLAIN = (th.Tensor, th.nn.Parameter)
 
 
 class Link(Protocol):
-    """A linear layer that a chain runs by its connections."""
+    """The view of a linear layer that a chain has."""
 
     in_features: int
     out_features: int
     bias: Any
 
     def live(self) -> tuple[Structure, th.Tensor]:
-        """The connections to compute with now, and their values."""
+        """Give the connections to compute with now, and their values."""
 
     def held(self) -> tuple[Structure, th.Tensor]:
-        """The same without a graph, where another thread may move connections."""
+        """As :meth:`live`, without a graph and while another thread may move connections."""
 
 
 class Chain:
-    """Sparse layers that follow each other, each perhaps with an activation.
+    """Sparse layers that follow each other, with or without activations.
 
     :param layers: the layers
-    :param activations: what follows each: None, or a module that tells its slope by its result
+    :param activations: the activation after each layer, whose slope follows from its result; None:
+        no activation
     """
 
     def __init__(self, layers: Sequence[Link], activations: Sequence[nn.Module | None]) -> None:
@@ -43,22 +44,22 @@ class Chain:
         self.activations = list(activations)
         self.columns = self.layers[0].in_features
         self.rows = self.layers[-1].out_features
-        # A graph must not hold the layers: Python's garbage collector does not see through it, and
-        # SB3's action distributions remember the last one.
+        # A graph must not hold the layers: Python's garbage collector cannot see through it, and
+        # SB3's action distributions keep the last one.
         self._references = [ref(layer) for layer in self.layers]
 
     def __call__(self, x: th.Tensor) -> th.Tensor:
-        """The layers on ``x`` of shape ``(..., columns)``."""
+        """Apply the layers to ``x`` of shape ``(..., columns)``."""
         x, batch, lead = self.flattened(x)
         return self.run(x, batch, False, False).view(*lead, self.rows)
 
     def flattened(self, x: th.Tensor) -> tuple[th.Tensor, int, th.Size]:
-        """The input as ``(batch, columns)``, its batch, and the dimensions it had before that.
+        """Flatten the input to ``(batch, columns)``; give its batch and leading dimensions too.
 
-        :raises UnsupportedError: for anything but float32 in main memory, ``columns`` wide
+        :raises UnsupportedError: unless it is float32 on the CPU and ``columns`` wide
         """
         if x.is_floating_point() and th.is_autocast_enabled("cpu"):
-            x = x.float()  # of a layer before, which does what autocast says
+            x = x.float()  # autocast may have changed the result of an earlier layer
         if x.dtype != th.float32 or x.device.type != "cpu" or x.shape[-1:] != (self.columns,):
             raise UnsupportedError(
                 f"a layer in sparse storage takes float32 on the CPU with "
@@ -70,7 +71,7 @@ class Chain:
         return x, x.shape[0], lead
 
     def run(self, x: th.Tensor, batch: int, tiled_in: bool, tiled_out: bool) -> th.Tensor:
-        """The layers on rows ``(batch, columns)`` or tiles, giving rows or tiles."""
+        """Apply the layers to rows ``(batch, columns)`` or tiles; the result is rows or tiles."""
         structures, parameters = [], []
         seen = watched(x)
         acting = not seen and not th.is_grad_enabled()
@@ -90,5 +91,5 @@ class Chain:
 
 
 def watched(x: th.Tensor) -> bool:
-    """Whether somebody wants to see single operations on ``x``, e.g. by fake tensors."""
+    """Whether ``x`` or a mode of torch observes single operations, e.g. as fake tensors do."""
     return type(x) not in PLAIN or watching()

@@ -1,4 +1,4 @@
-"""Whether modules still are what they were when somebody looked at them."""
+"""Detects changes to modules."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from torch import nn
 
 
 def patched(module: nn.Module) -> bool:
-    """Whether somebody has put a function of his own over one of the methods."""
+    """Whether an attribute of the object hides one of its class's methods."""
     kind = type(module)
     return any(callable(getattr(kind, name, None)) for name in vars(module))
 
 
 class ChangeDetector:
-    """Notices when a module gets or loses a child, a tensor or an attribute.
+    """Detects that a module gets or loses a child, a tensor or an attribute.
 
-    That is how modules are replaced, patched, parametrized and pruned. What tensors hold may change
-    freely. A look takes a microsecond or two, where walking over the modules takes fifty.
+    So it notices when modules are replaced, patched, parametrized or pruned; the content of tensors
+    may change freely. A check takes one or two microseconds, walking over the modules fifty.
 
-    :param modules: what to watch
-    :param tensors: whether their parameters and buffers shall be the same objects too
+    :param modules: the modules
+    :param tensors: whether their parameters and buffers must stay the same objects too
     """
 
     def __init__(self, modules: Iterable[nn.Module], tensors: bool = True) -> None:
@@ -36,7 +36,7 @@ class ChangeDetector:
         self._sizes = list(map(len, self._sized))
 
     def unchanged(self) -> bool:
-        """Whether all of it is as it was."""
+        """Whether nothing has changed since creation."""
         return list(map(len, self._sized)) == self._sizes and all(
             map(is_, chain.from_iterable(map(dict.values, self._named)), self._seen)
         )

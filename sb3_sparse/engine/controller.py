@@ -1,4 +1,4 @@
-"""Keeps time and moves masks: hooks on gradients and optimizers of one policy."""
+"""Moves the masks of one policy by hooks on its gradients and optimizers."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from sb3_sparse.engine.storage import LayerStorage, check_masked, save_moments
 
 
 class Controller:
-    """Hooks of a policy's sparse networks.
+    """Keeps the gradients and masks of a policy's sparse networks.
 
-    Each gradient is masked where it arrives, before anything clips it. Each optimizer's step first
-    advances the clocks of the networks it owns and, where an update is due, moves their masks; the
-    step itself is then taken with gradients under the new mask.
+    A hook masks each gradient on arrival, before it is clipped. Before each step of an optimizer,
+    another hook advances the clocks of the networks that it owns and moves their masks where an
+    update is due; the step then uses gradients under the new mask.
 
     Copies and pickles of a controller have no plan, and no hooks until :meth:`attach` is called.
 
@@ -38,7 +38,7 @@ class Controller:
     :param seed: mask seed, not negative
     :param functional_gradients: whether the algorithm may use ``torch.autograd.grad``
     :param weight_decay: coupled L2 coefficient, added to the gradient of every weight
-    :param auto: chooses the storage of layers; None leaves it as it is
+    :param auto: chooses the storage of layers; None keeps it
     """
 
     def __init__(
@@ -58,11 +58,11 @@ class Controller:
         self._in_force: Callable[[], bool] = bool
         self.progress = 0.0
         self.updates_due = 0
-        """Updates that have come due since the plan was made, of all networks together."""
+        """Updates due since the plan was made, over all networks."""
         self.soft_targets = False
-        """Whether targets follow a mask at once; as long as nobody says so, they need not."""
+        """Whether targets follow a mask at once."""
         self._gradient_hooks, self._optimizer_hooks = Hooks(), Hooks()
-        self._dense = not any(network.sparse_layers for network in networks)  # and it stays so
+        self._dense = not any(network.sparse_layers for network in networks)  # for good
         self._warned = self._dense
 
     def __getstate__(self) -> dict[str, Any]:
@@ -70,12 +70,12 @@ class Controller:
 
     @property
     def layers(self) -> Iterable[LayerStorage]:
-        """Every sparse layer once."""
+        """Every layer within a budget, once."""
         return (layer for network in self.networks for layer in network.layers)
 
     @property
     def sparsity(self) -> float:
-        """Removed fraction of all connections within the budgets, now."""
+        """Currently removed fraction of all connections within the budgets."""
         return 1.0 - sum(n.nnz for n in self.networks) / sum(n.size for n in self.networks)
 
     @property
@@ -87,13 +87,13 @@ class Controller:
         return [network for network in self.networks if network.optimizer is optimizer]
 
     def attach(self) -> None:
-        """Register the hooks, unless they already are on these very weights and optimizers."""
+        """Register the hooks, unless these very weights and optimizers have them already."""
         changed = self._attach_to_gradients()
         if self._optimizer_hooks.attach(self.optimizers, self._hook_optimizers) or changed:
             watch(self)
 
     def _attach_to_gradients(self) -> bool:
-        """Register the hooks on gradients alone; whether they were missing."""
+        """Register the hooks on gradients alone; tell whether they were missing."""
         layers = chain.from_iterable(network.sparse_layers for network in self.networks)
         weights = [layer.weight for layer in layers if not layer.frozen]
         return self._gradient_hooks.attach(weights, self._hook_gradients)
@@ -128,18 +128,18 @@ class Controller:
         return handles
 
     def to_sparse(self, root: nn.Module, names: Container[str] | None = None) -> None:
-        """Store linear layers as their active connections from now on; they stay in place.
+        """Move linear layers to sparse storage, in place.
 
-        :param root: the policy, whose ``Sequential`` modules shall run them as chains
-        :param names: which; None: all
-        :raises UnsupportedError: if their optimizer needs matrices
+        :param root: the policy, whose ``Sequential`` modules then run them as chains
+        :param names: names of the layers; None: all
+        :raises UnsupportedError: if their optimizer needs dense weights
         """
         for network in self.networks:
             network.to_sparse(names, self.optimizers)
         self._hook_anew(root)
 
     def choose_storage(self, root: nn.Module) -> None:
-        """Let ``compute="auto"`` decide anew where there are other connections than the last time.
+        """Apply the rule of ``compute="auto"`` again if connections have been removed since.
 
         :param root: the policy
         """
@@ -148,7 +148,7 @@ class Controller:
             self.to_sparse(root, chosen)
 
     def to_masked(self, root: nn.Module) -> None:
-        """Store every layer masked from now on.
+        """Move every layer to masked storage, in place.
 
         :param root: the policy
         """
@@ -164,11 +164,11 @@ class Controller:
         self.attach()
 
     def begin_training(self, root: nn.Module) -> None:
-        """Start a round of gradient steps of the policy ``root``: hooks on, nothing outdated."""
+        """Prepare the policy ``root`` for a round of gradient steps."""
         self.attach()
         self.choose_storage(root)
         if not self._in_force():
-            self.plan = None  # of a training that was interrupted
+            self.plan = None  # left from an interrupted training
         for layer in self.layers:
             if layer.gradient is not None:
                 layer.gradient.dense_grad = None
@@ -176,31 +176,32 @@ class Controller:
             network.settle(self.soft_targets)
 
     def enforce(self) -> None:
-        """Set to 0 what masks have inactive, whoever wrote it."""
+        """Set inactive weights to 0, whoever wrote them."""
         for network in self.networks:
             network.remask()
 
     def notice(self) -> None:
-        """The same, where torch has counted a write since."""
+        """As :meth:`enforce`, but only for weights that torch has seen written since."""
         for network in self.networks:
             network.notice()
 
     def start(self, plan: Plan, soft_targets: bool, in_force: Callable[[], bool]) -> None:
-        """Let masks move from now on.
+        """Start moving masks.
 
+        :param plan: the schedule
         :param soft_targets: whether targets follow the mask at once (Polyak averaging), or at the
             next hard copy
-        :param in_force: whether the training that the plan was made for still goes on
+        :param in_force: tells whether the training that the plan was made for is still running
         """
         self.plan = plan
         self.updates_due = 0
         for network in self.networks:
-            network.pending = None  # of a training that was interrupted
+            network.pending = None  # left from an interrupted training
         self._in_force = in_force
         self.soft_targets = soft_targets
 
     def stop(self) -> None:
-        """Do what is still due and freeze the masks."""
+        """Carry out the updates that are still due, and freeze the masks."""
         self.flush()
         for network in self.networks:
             if self.plan is not None and network.must_finish(self.plan, self.progress):
@@ -208,7 +209,7 @@ class Controller:
         self.plan = None
 
     def flush(self) -> None:
-        """Carry out updates that waited for the end of the rollout."""
+        """Carry out updates that have waited for the end of the rollout."""
         for network in self.networks:
             if network.pending is not None and self.plan is not None:
                 self._move(network, self.plan, network.pending)
@@ -230,24 +231,24 @@ class Controller:
                 warn_of_no_plan(self.sparsity)
             for layer in network.sparse_layers:
                 layer.notice()
-                layer.mask_gradient()  # others may have written it after our hooks
+                layer.mask_gradient()  # which others may have written after our hooks
             if self.plan is not None:
                 self._update_if_due(network, self.plan)
             if self.weight_decay:
                 add_weight_decay(network.weights, self.weight_decay)
 
     def _trust(self, optimizer: th.optim.Optimizer, args: object, kwargs: object) -> None:
-        """Of optimizers that keep a weight at 0 whose gradient is 0."""
+        """Runs after the step of an optimizer that keeps weights at 0 whose gradient is 0."""
         for network in self._owned_by(optimizer):
             network.trust()
 
     def _after_step(self, optimizer: th.optim.Optimizer, args: object, kwargs: object) -> None:
-        """Of optimizers that write to what is inactive."""
+        """Runs after the step of an optimizer that writes to inactive weights."""
         for network in self._owned_by(optimizer):
             network.remask()
 
     def awaits(self, optimizer: th.optim.Optimizer) -> bool:
-        """Whether the optimizer's next step is more than a step: masks move at it, say."""
+        """Whether the optimizer's next step needs more than the step, e.g. a mask update."""
         return any(
             network.due(self.plan, network.clock + 1, self.progress)
             or (self.plan is None and not self._warned and network.denser)
@@ -256,12 +257,12 @@ class Controller:
         )
 
     def wants_gradients(self, optimizer: th.optim.Optimizer) -> bool:
-        """Whether dense gradients are wanted at the optimizer's next step."""
+        """Whether the optimizer's next step needs dense gradients."""
         owned = self._owned_by(optimizer)
         return any(network.wants_gradients(self.plan, self.progress) for network in owned)
 
     def passed(self, optimizer: th.optim.Optimizer) -> None:
-        """Count a step that somebody has taken in the optimizer's place."""
+        """Count a step that was taken in the optimizer's place."""
         for network in self._owned_by(optimizer):
             network.clock += 1
 

@@ -1,8 +1,8 @@
-"""Optimizers of the user's own that move a policy's weights: behaviour cloning, say.
+"""Support for the user's own optimizers on a policy's weights, for behaviour cloning say.
 
-Their steps are no business of a policy's clocks. But what they remember of a weight must follow its
-mask, and what they write to inactive connections must go. Torch has hooks on the steps of all
-optimizers for this; they look at nothing but the weights of sparse layers.
+Their steps do not advance the policy's clocks. But their moments of a weight must follow its mask,
+and what they write to inactive connections must be removed. Torch's hooks on the steps of all
+optimizers do this, for the weights of sparse layers alone.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from sb3_sparse.errors import UnsupportedError
 
 
 class Owner(Protocol):
-    """Has sparse layers, and optimizers that it looks after itself."""
+    """Has sparse layers, and optimizers of its own."""
 
     @property
     def layers(self) -> Iterable[LayerStorage]:
-        """Every sparse layer once."""
+        """Every layer within a budget, once."""
 
     @property
     def optimizers(self) -> list[th.optim.Optimizer]:
@@ -37,7 +37,7 @@ class Owner(Protocol):
 
 
 class _Found(NamedTuple):
-    """The sparse layers that an optimizer moves, and what that was worked out from."""
+    """The sparse layers that an optimizer moves, and the facts that this was derived from."""
 
     changes: int
     parameters: int  # hash of their ids
@@ -51,19 +51,19 @@ _owners: WeakSet[Any] = WeakSet()
 _found: WeakKeyDictionary[th.optim.Optimizer, _Found] = WeakKeyDictionary()
 _followed: WeakKeyDictionary[th.optim.Optimizer, WeakKeyDictionary[LayerStorage, object]]
 _followed = WeakKeyDictionary()
-"""The connections that each optimizer's moments of each layer go by."""
+"""The connections that each optimizer's moments fit, by layer."""
 _count: Callable[[], int] = count(1).__next__
 _changes = 0
 
 
 def watch(owner: Owner) -> None:
-    """Look after the layers of ``owner`` from now on; it is held weakly.
+    """Follow every optimizer that moves layers of ``owner``, which is held weakly.
 
-    Call again when its layers or optimizers are others.
+    Call it again when the owner's layers or optimizers have changed.
     """
     global _changes
     if all(layer.always_full for layer in owner.layers):
-        return  # there is nothing to look after
+        return  # no weight is ever inactive
     if not _changes:
         register_optimizer_step_pre_hook(_before_step)
         register_optimizer_step_post_hook(_after_step)
@@ -108,15 +108,15 @@ def _layers_of(optimizer: th.optim.Optimizer) -> Iterator[LayerStorage]:
 
 
 class Guard:
-    """Looks after the layers of a network without a policy around it: a copy of an actor, say.
+    """Keeps the masks of a network outside its policy, such as a copy of an actor.
 
-    Gradients are masked where they arrive, and optimizers are followed as :func:`watch` says.
+    It masks gradients on arrival and follows optimizers as :func:`watch` does.
 
     :param layers: the sparse layers of the copy
     """
 
     optimizers: list[th.optim.Optimizer] = []
-    """None that it would look after itself."""
+    """It has none of its own."""
 
     def __init__(self, layers: Iterable[LayerStorage]) -> None:
         self.layers = list(layers)

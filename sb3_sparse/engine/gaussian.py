@@ -1,4 +1,4 @@
-"""Samples of Gaussians and their log probabilities, in one call of the kernels."""
+"""Gaussian samples and their log probabilities, in one call of the kernels."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from sb3_sparse.engine.room import Room
 def gaussian(
     mean: th.Tensor, log_std: th.Tensor, noise: th.Tensor | None
 ) -> tuple[th.Tensor, th.Tensor] | None:
-    """Actions of Gaussians, shape ``(n, dim)``, and their log probabilities ``(n,)``.
+    """Compute actions ``(n, dim)`` and their log probabilities ``(n,)``; None if one is not finite.
 
-    None if one is not finite.
+    All arguments are contiguous float32 tensors on the CPU.
 
-    :param mean: shape ``(n, dim)``; float32 on the CPU and contiguous, as all
+    :param mean: shape ``(n, dim)``
     :param log_std: shape ``(dim,)``
-    :param noise: of a standard normal distribution, shape ``(n, dim)``; None: the mean acts
+    :param noise: standard normal, shape ``(n, dim)``; None: the mean is the action
     """
     n, size = mean.shape
     room = Room(n * size + n)
@@ -36,14 +36,14 @@ def gaussian(
 def squashed(
     mean: th.Tensor, log_std: th.Tensor, bounds: tuple[float, float], noise: th.Tensor | None
 ) -> tuple[th.Tensor, th.Tensor] | None:
-    """Samples of Gaussians, and the actions that a tanh makes of them, of the mean's shape.
+    """Compute Gaussian samples and their tanh, both of the mean's shape; None if not finite.
 
-    None if one is not finite.
+    All tensors are contiguous float32 on the CPU.
 
-    :param mean: shape ``(n, dim)``; float32 on the CPU and contiguous, as all
-    :param log_std: the same shape; brought into its bounds in place
-    :param bounds: of ``log_std``
-    :param noise: of a standard normal distribution, shape ``(n, dim)``; None: the mean acts
+    :param mean: shape ``(n, dim)``
+    :param log_std: shape ``(n, dim)``; clamped to its bounds in place
+    :param bounds: bounds of ``log_std``
+    :param noise: standard normal, shape ``(n, dim)``; None: the mean is the sample
     """
     size = mean.numel()
     room = Room(2 * size)

@@ -1,14 +1,13 @@
-"""Masks a layer's gradient as it arrives and keeps the dense one for a method that asks.
+"""Hooks that mask a layer's gradient and keep the dense one for methods that need it.
 
-Two kinds of algorithm, two hooks:
+There are two, for two kinds of algorithm:
 
-- Most call ``backward()``, perhaps on other losses too (SAC's actor loss fills the critics'
-  gradients after their step). The last gradient before the owning optimizer's step is the one it
-  applies.
+- Most algorithms call ``backward()``, perhaps on other losses too (SAC's actor loss fills the
+  critics' gradients after their step). The optimizer applies the last gradient before its step.
 - TRPO takes the actor's gradient with ``torch.autograd.grad``, which only a tensor hook sees: first
   with a graph (of the KL divergence), then the plain one of the objective, then Hessian products.
-  The first plain gradient is the one wanted. Masked there, conjugate gradients and line search work
-  in the space of the active weights (but for the noise that TRPO starts them from, about 1e-8).
+  The first plain gradient is the relevant one. Masked there, conjugate gradients and line search
+  stay in the space of the active weights (but for TRPO's initial noise of about 1e-8).
 """
 
 from __future__ import annotations
@@ -22,14 +21,14 @@ import torch as th
 from torch.utils.hooks import RemovableHandle
 
 DenseGradient = Callable[[], th.Tensor]
-"""Gives a dense gradient in the weight's shape; what it costs, it costs when it is called."""
+"""Computes a dense gradient in the weight's shape when called."""
 
 
 def weakly(hook: Any) -> Callable[[th.Tensor], Any]:
-    """The hook without holding on to its object.
+    """Wrap a hook so that it does not keep its object alive.
 
-    Python's garbage collector does not see through a tensor that torch's C++ side refers to. A hook
-    that held the layer, and so the weight that it hangs on, would keep every model for ever.
+    Python's garbage collector cannot see through a tensor that torch's C++ side refers to. A hook
+    that held the layer, and so its own weight, would keep every model forever.
 
     :param hook: a bound method
     """
@@ -45,7 +44,7 @@ def weakly(hook: Any) -> Callable[[th.Tensor], Any]:
 class GradientMask(ABC):
     """Hook on the gradient of one layer.
 
-    :param capturing: whether the dense gradient will be wanted at the next step
+    :param capturing: tells whether the next step needs the dense gradient
     """
 
     def __init__(self, capturing: Callable[[], bool]) -> None:
@@ -54,8 +53,8 @@ class GradientMask(ABC):
 
     @abstractmethod
     def attach(self) -> RemovableHandle:
-        """Register the hook on the weight as it is now."""
+        """Register the hook on the present weight."""
 
     @abstractmethod
     def take(self) -> DenseGradient | None:
-        """The dense gradient that the optimizer is about to apply, or None if there is none."""
+        """Hand over the dense gradient that the optimizer is about to apply; None: no gradient."""

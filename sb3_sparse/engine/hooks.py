@@ -1,4 +1,4 @@
-"""Hooks on a set of objects, put up anew when the set is another."""
+"""Hooks on a set of objects, registered again when the set changes."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ class Hooks:
     def attach(
         self, objects: Sequence[object], register: Callable[[], list[RemovableHandle]]
     ) -> bool:
-        """Have hooks on these very objects, and no others.
+        """Make sure that exactly these objects have the hooks.
 
-        :param register: puts them up
-        :return: whether it was necessary
+        :param register: registers the hooks
+        :return: whether it was called
         """
         if len(objects) == len(self._hooked) and all(
             one is other for one, other in zip(objects, self._hooked, strict=True)
@@ -36,7 +36,7 @@ class Hooks:
         return True
 
     def remove(self) -> None:
-        """Take the hooks off."""
+        """Remove the hooks."""
         for handle in self._handles:
             handle.remove()
         self._handles, self._hooked = [], []

@@ -1,9 +1,8 @@
 """Networks that act: up to 16 inputs through all layers in one call of the kernels.
 
-In a rollout a layer is a few microseconds of arithmetic, and what surrounds it in torch is more.
-Here one call takes an observation through every layer, activation and head, and keeps nothing for a
-gradient. Masked layers are read through their masks, so what is inactive counts as 0 whoever has
-written it.
+In a rollout a layer takes a few microseconds of arithmetic and more than that of torch's overhead.
+Here one call takes an observation through every layer, activation and head, without a graph. It
+reads masked layers through their masks, so inactive weights count as 0 whoever wrote them.
 """
 
 from __future__ import annotations
@@ -38,11 +37,11 @@ DOUBLES: dict[Any, bool] = {
     **{th.float32: False, th.float64: True},
     **{np.dtype(np.float32): False, np.dtype(np.float64): True},
 }
-"""Types of observations that the kernels read, and whether these are twice as wide as theirs."""
+"""Types of observations that the kernels read, and whether they are float64."""
 
 
 def by_modules(x: th.Tensor) -> bool:
-    """Whether networks must act module by module: for those who watch, or to be compiled."""
+    """Whether networks must act module by module: to be observed or compiled."""
     return is_compiling() or watched(x)
 
 
@@ -50,8 +49,8 @@ class Step(NamedTuple):
     """One layer and the activation behind it.
 
     :param layer: the layer
-    :param activation: what follows; None: nothing
-    :param source: number of the step whose result is its input; -1: the observations
+    :param activation: None: no activation
+    :param source: number of the step that gives its input; -1: the observations
     """
 
     layer: nn.Linear
@@ -60,7 +59,7 @@ class Step(NamedTuple):
 
 
 class Binding(NamedTuple):
-    """Where the tensors lie, ready for the kernels; holds them, so that nobody frees them."""
+    """Addresses of the tensors for the kernels; holds the tensors, so that they stay allocated."""
 
     tensors: list[int]
     sizes: list[th.Size]
@@ -71,9 +70,9 @@ class Binding(NamedTuple):
 
 
 class Inference:
-    """Networks that share their input, computed at once.
+    """Computes networks that share their input at once.
 
-    Made by :meth:`of`. Call it with inputs of shape ``(n, features)``.
+    Create it with :meth:`of`, and call it with inputs of shape ``(n, features)``.
     """
 
     def __init__(self, steps: list[Step], ends: list[int], modules: Iterable[nn.Module]) -> None:
@@ -100,10 +99,10 @@ class Inference:
 
     @classmethod
     def of(cls, paths: Paths, hooked: Iterable[nn.Module] = ()) -> Inference | None:
-        """What computes the networks at once; None if they have other parts than it knows.
+        """Create it for some networks; None if they have parts that the kernels do not compute.
 
-        :param paths: where two begin with the same layers, these are computed once
-        :param hooked: modules around them whose hooks would want to see the call
+        :param paths: modules of each network; layers that two networks share are computed once
+        :param hooked: modules around the networks, whose hooks expect to see the call
         """
         modules = [*hooked, *modules_of(paths)]
         if not paths or any(map(patched, modules)) or why_missing() is not None:
@@ -136,15 +135,15 @@ class Inference:
 
     @property
     def watched(self) -> bool:
-        """Whether somebody wants to see the modules called, or in another precision."""
+        """Whether hooks or autocast require that the modules are called."""
         return any(self._hooks) or th.is_autocast_enabled("cpu") or bool(any_global_hook())
 
     def __call__(self, x: th.Tensor) -> list[th.Tensor] | None:
-        """Each network's result, shape ``(n, its outputs)``, without a graph.
+        """Compute each network's result, shape ``(n, its outputs)``, without a graph.
 
-        None where the modules must be called one by one: for more inputs than 16, or others than
-        float32 ones of the right width on the CPU, while somebody watches (hooks, tracing,
-        autocast), and for results that are not finite, about which callers have their own to say.
+        None where the modules must be called one by one: for more than 16 inputs; for inputs that
+        are not float32 of the right width on the CPU; under hooks, tracing or autocast; and for
+        results that are not finite, which callers report in their own way.
 
         :param x: shape ``(n, features)``
         """
@@ -155,16 +154,16 @@ class Inference:
         return self.of_observations(x)
 
     def _leave(self) -> list[th.Tensor] | None:
-        """Let the modules compute what the kernels would: without what is inactive."""
+        """Prepare the modules to compute the same: set inactive weights to 0."""
         for layer in self._layers:
             for masked in MaskedStorage.below(layer):
                 masked.remask()
         return None
 
     def of_observations(self, x: th.Tensor) -> list[th.Tensor] | None:
-        """The same for 1 to 16 observations, which may be float64 and of several dimensions.
+        """As a call, for 1 to 16 observations that may be float64 and of several dimensions.
 
-        :param x: shape ``(n, *shape of an observation)``; they must not go :func:`by_modules`
+        :param x: shape ``(n, *shape of an observation)``; :func:`by_modules` must be False
         """
         n, doubles = len(x), DOUBLES.get(x.dtype)
         if doubles is None or not x.is_cpu or x.numel() != n * self._columns:
@@ -175,7 +174,7 @@ class Inference:
         return self._leave() if room is None else [room.tensor(*at) for at in self._split(n)]
 
     def of_array(self, x: NDArray[Any]) -> list[NDArray[np.float32]] | None:
-        """The same for observations in an array, of any type and number, as arrays."""
+        """As a call, for an array of observations of any type and number; gives arrays."""
         n, doubles = x.shape[0], DOUBLES.get(x.dtype)
         if doubles is None or not 0 < n <= MOST_INPUTS or x.size != n * self._columns or watching():
             return None
@@ -183,11 +182,11 @@ class Inference:
         return None if room is None else [room.array(*at) for at in self._split(n)]
 
     def _compute(self, n: int, doubles: bool, x: int | bytes) -> Room | None:
-        """The networks' results, one after the other.
+        """Compute the networks' results, one after the other.
 
         :param n: number of inputs
-        :param doubles: whether they are float64, not float32
-        :param x: where they lie, or they themselves
+        :param doubles: whether the inputs are float64 rather than float32
+        :param x: address of the inputs, or their bytes
         """
         on_cpu = self._tensors[0].is_cpu
         binding = self._bound() if on_cpu and not self.watched else None
@@ -199,16 +198,16 @@ class Inference:
         return None if failed else room
 
     def _split(self, n: int) -> Iterator[tuple[tuple[int, int], int]]:
-        """Shape of each network's results, and where they begin among all."""
+        """Give the shape of each network's results, and where they begin."""
         return (
             ((n, width), n * place) for width, place in zip(self._widths, self._places, strict=True)
         )
 
     def _bound(self) -> Binding | None:
-        """Where the tensors lie now; None if the kernels cannot read one."""
+        """Give the present addresses of the tensors; None if the kernels cannot read one."""
         for target in self._targets:
             if target.snapshot is not None:
-                return None  # it awaits its copy
+                return None  # it waits for the next copy
         tensors = [tensor.data_ptr() for tensor in self._tensors]
         sizes = list(map(th.Tensor.size, self._tensors))
         structures = [layer.structure for layer in self._sparse]
@@ -227,9 +226,9 @@ class Inference:
         return binding
 
     def _bind(self) -> Binding | None:
-        """Hold what is there now, for as long as the kernels may read it.
+        """Hold the present tensors for as long as the kernels may read them.
 
-        While another thread moves connections a structure may not fit its values for a moment.
+        While another thread moves connections, a structure may briefly not fit its values.
         """
         for _ in range(TRIES):
             structures = [layer.structure for layer in self._sparse]
@@ -252,10 +251,10 @@ class Inference:
         )
 
     def _arguments(self, structures: Iterator[Structure], held: Iterator[th.Tensor]) -> Any:
-        """``step_t`` of every step; None if a tensor is not what the kernels read.
+        """Fill an array of ``step_t``; None if the kernels cannot read a tensor.
 
-        :param structures: of the sparse layers
-        :param held: tensors in the order of those of the layers
+        :param structures: connections of the sparse layers
+        :param held: the layers' tensors, in order
         """
         fields: list[int] = []
         for number, (layer, activation, source) in enumerate(self._steps):
@@ -288,5 +287,5 @@ class Inference:
 
 
 def _tensors_of(layer: nn.Linear) -> tuple[th.Tensor | None, ...]:
-    """Weight, bias and mask."""
+    """Give the weight, bias and mask of a layer."""
     return layer.weight, layer.bias, layer._buffers.get(FLOAT_MASK_KEY)

@@ -1,4 +1,4 @@
-"""Keeps what computes networks at once, for as long as their modules are the same."""
+"""Keeps an :class:`Inference` for as long as its modules stay the same."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from sb3_sparse.engine.paths import Paths, modules_of
 
 
 class KeptInference:
-    """An inference that is made anew when modules have changed. Copies and pickles begin empty."""
+    """Creates an inference anew whenever modules have changed. Copies and pickles start empty."""
 
     def __init__(self) -> None:
         self._changes: ChangeDetector | None = None
@@ -26,14 +26,14 @@ class KeptInference:
         return KeptInference, ()
 
     def get(self, find: Callable[[], tuple[Paths, list[nn.Module]]]) -> Inference | None:
-        """The inference; None where the modules must be called one by one.
+        """Give the inference; None where the modules must be called one by one.
 
-        :param find: the paths, and the modules around them from the outermost, whose hooks are run
-            anyhow, to those that the inference passes over
+        :param find: gives the paths, and the modules around them from the outermost inwards; hooks
+            of the outermost run in any case, those of the others would be skipped
         """
         if self._changes is None or not self._changes.unchanged():
             paths, around = find()
             changes = ChangeDetector([*around, *modules_of(paths)])
             self._inference = Inference.of(paths, around[1:])
-            self._changes = changes  # last: another thread may be looking
+            self._changes = changes  # last, for other threads
         return self._inference

@@ -16,26 +16,26 @@ from sb3_sparse.errors import UnsupportedError
 
 MASK_KEY = "weight_mask"
 TRIES = 100
-"""How often to look for layers whose connections another thread is moving."""
+"""How often to read a layer again whose connections another thread is moving."""
 
 
 class Listener(Protocol):
-    """Wants a layer's dense gradient now and then."""
+    """Asks for a layer's dense gradient before mask updates."""
 
     def wanted(self) -> bool:
-        """Whether to keep what it needs of this backward pass."""
+        """Whether it needs the dense gradient of this backward pass."""
 
     def note(self, dense_grad: Callable[[], th.Tensor]) -> None:
-        """Take what computes it, in the weight's dense shape, from saved activations."""
+        """Take a function that computes it, in the weight's dense shape."""
 
 
 class Snapshot(NamedTuple):
-    """What a hard target computes with from a move of its mask to the next copy.
+    """The weights that a hard target uses between a mask update and its next copy.
 
-    :param structure: the connections that it had before the move
+    :param structure: its connections before the update
     :param values: their weights, shape ``(structure.nnz,)``
-    :param placed: what its Parameter has held since the move: ``values`` where the new mask has
-        them, else 0. As soon as the Parameter holds anything else, somebody has written it.
+    :param placed: the content of its Parameter since the update: ``values`` where the new mask has
+        them, else 0. Any other content means that the Parameter has been written.
     """
 
     structure: Structure
@@ -46,20 +46,19 @@ class Snapshot(NamedTuple):
 class SparseLinear(nn.Linear):
     """``nn.Linear`` whose Parameter ``weight`` holds the values of the active connections.
 
-    It has shape ``(nnz,)``, by rows; where they are says ``structure``. In a state_dict it is what
-    a masked layer is: the dense weight, and (unless it is a target's) the boolean ``weight_mask``.
-
-    Made by :meth:`convert` out of a linear layer that stays in place.
+    The Parameter has shape ``(nnz,)``, row-major; ``structure`` gives the indices. A state_dict has
+    the same entries as that of a masked layer: the dense weight and, except for targets, the
+    boolean ``weight_mask``. :meth:`convert` makes one out of a linear layer, in place.
     """
 
     weight: nn.Parameter
     structure: Structure
     snapshot: Snapshot | None
-    """What a hard target computes with if the mask has moved since the last copy."""
+    """What a hard target computes with if the mask has moved since its last copy; else None."""
     is_target: bool
     listener: Listener | None
     check_mask: Callable[[th.Tensor], None] | None
-    """Refuses a saved mask that does not go with the layer's sparsity."""
+    """Rejects a saved mask that does not fit the layer's sparsity."""
 
     @classmethod
     def convert(cls, module: nn.Linear, structure: Structure, is_target: bool) -> SparseLinear:
@@ -84,11 +83,11 @@ class SparseLinear(nn.Linear):
         replace_data(self.weight, dense)
 
     def __getstate__(self) -> dict[str, Any]:
-        # A copy's listener is put up when its own hooks are.
+        # A copy gets a listener with its own hooks.
         return {**self.__dict__, "listener": None}
 
     def forward(self, input: th.Tensor) -> th.Tensor:
-        """As of ``nn.Linear``."""
+        """Apply the layer, as ``nn.Linear`` does."""
         return Chain([self], [None])(input)
 
     def _apply(self, fn: Any, recurse: bool = True) -> Any:
@@ -96,9 +95,9 @@ class SparseLinear(nn.Linear):
         return super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
 
     def apply(self, fn: Callable[[nn.Module], Any]) -> SparseLinear:
-        """As in torch: ``fn`` may draw the weight anew and sees it dense, shape ``(out, in)``.
+        """Apply ``fn`` as torch does; it sees the dense weight, ``(out, in)``, and may write it.
 
-        What it writes to an inactive connection is dropped.
+        Values that it writes to inactive connections are dropped.
         """
         dense, grad = self.dense(), self.weight.grad
         replace_data(self.weight, dense)
@@ -111,24 +110,24 @@ class SparseLinear(nn.Linear):
         return self
 
     def reset_parameters(self) -> None:
-        """Draw weights and biases as ``nn.Linear`` does; what is inactive stays absent."""
+        """Draw weights and biases as ``nn.Linear`` does; inactive connections stay absent."""
         if self.weight.dim() == 2:  # within :meth:`apply`, or while torch builds the layer
             super().reset_parameters()
         else:
             self.apply(lambda _: nn.Linear.reset_parameters(self))
 
     def live(self) -> tuple[Structure, th.Tensor]:
-        """The connections to compute with now, and their values."""
+        """Give the connections to compute with now, and their values."""
         if self.snapshot is not None:
             if th.equal(self.weight.detach(), self.snapshot.placed):
                 return self.snapshot.structure, self.snapshot.values
-            self.snapshot = None  # the online network has been copied or blended in since
+            self.snapshot = None  # the Parameter was written: copied or averaged
         return self.structure, self.weight
 
     def held(self) -> tuple[Structure, th.Tensor]:
-        """The same without a graph, for threads that act while another moves connections.
+        """As :meth:`live`, without a graph, for threads that act while another moves connections.
 
-        What it returns belongs together and stays in memory.
+        The two results fit each other and stay in memory.
         """
         for _ in range(TRIES):
             structure, weight = self.live()
@@ -139,14 +138,14 @@ class SparseLinear(nn.Linear):
         return structure, values
 
     def dense(self) -> th.Tensor:
-        """The weights, 0 where inactive, shape ``(rows, columns)``."""
+        """Give the weights, 0 where inactive, shape ``(rows, columns)``."""
         structure, values = self.live()
         weight = values.detach().new_zeros(structure.shape[0] * structure.shape[1])
         weight[th.from_numpy(structure.flat)] = values.detach()
         return weight.view(structure.shape)
 
     def restructure(self, structure: Structure, values: th.Tensor) -> None:
-        """Replace connections and values. Their gradient, if there is one, is dropped.
+        """Replace connections and values, and drop the gradient.
 
         :param values: shape ``(structure.nnz,)``
         """
@@ -155,9 +154,9 @@ class SparseLinear(nn.Linear):
         replace_data(self.weight, values)
 
     def await_copy(self, structure: Structure) -> None:
-        """Compute with what is there until somebody writes the weights (for hard targets).
+        """Keep computing with the present weights until they are written (for hard targets).
 
-        :param structure: connections of the online layer from now on
+        :param structure: the new connections of the online layer
         """
         own, values = self.live()
         values = values.detach().clone()
@@ -165,14 +164,14 @@ class SparseLinear(nn.Linear):
         self.snapshot = Snapshot(own, values, self.weight.detach().clone())
 
     def take(self, structure: Structure, dense: th.Tensor) -> None:
-        """Have these connections from now on, with their dense weights.
+        """Replace the connections and take their weights from a dense array.
 
-        :param dense: shape ``structure.shape``; what lies outside the structure is dropped
+        :param dense: shape ``structure.shape``; values outside the structure are dropped
         """
         self.restructure(structure, dense.detach().reshape(-1)[th.from_numpy(structure.flat)])
 
     def take_saved(self, dense: th.Tensor) -> None:
-        """Have these dense weights; a target's that lie outside its connections are a snapshot.
+        """Take weights from a dense array; a target keeps those outside its mask as a snapshot.
 
         :param dense: shape ``structure.shape``
         """
@@ -196,7 +195,7 @@ class SparseLinear(nn.Linear):
         weight = state_dict.get(prefix + "weight")
         mask = state_dict.pop(prefix + MASK_KEY, None)
         if self.is_target:
-            mask = None  # it goes by that of the online layer
+            mask = None  # it follows the online layer
         elif mask is None and strict:
             missing_keys.append(prefix + MASK_KEY)
         for name, tensor in (("weight", weight), (MASK_KEY, mask)):
@@ -222,9 +221,9 @@ class SparseLinear(nn.Linear):
 
 
 def check_conversion(fn: Callable[[th.Tensor], th.Tensor]) -> None:
-    """Refuse what would make a sparse layer anything but float32 on the CPU.
+    """Reject a conversion of a sparse layer to anything but float32 on the CPU.
 
-    :param fn: what torch is about to apply to every parameter and buffer
+    :param fn: the conversion that torch is about to apply to every parameter and buffer
     :raises UnsupportedError: if it changes type or device
     """
     probe = fn(th.empty(0, dtype=th.float32, device="cpu"))

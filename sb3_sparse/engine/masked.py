@@ -1,4 +1,4 @@
-"""The first storage: the dense weight, 0 where inactive, and a mask."""
+"""Masked storage: the dense weight, 0 where inactive, and a mask."""
 
 from __future__ import annotations
 
@@ -23,15 +23,14 @@ FLOAT_MASK_KEY = "weight_mask_float"
 def _ignore_mask_key(
     module: nn.Module, state_dict: dict[str, Any], prefix: str, *_: object
 ) -> None:
-    """Pre-load hook of a target layer, which has no mask of its own."""
+    """Pre-load hook of a target layer: drop its entry for a mask, which it does not have."""
     state_dict.pop(prefix + MASK_KEY, None)
 
 
 def clear(weight: th.Tensor, mask: th.Tensor) -> None:
     """Set a weight to 0 where its mask is 0.
 
-    Torch counts no write, so that a graph that is alive, perhaps in another thread, goes on to be
-    valid.
+    Torch does not count this write, so an existing graph, perhaps in another thread, stays valid.
     """
     if why_missing() is None and readable(weight) and readable(mask):
         library().sb3_sparse_clear(weight.data_ptr(), mask.data_ptr(), weight.numel())
@@ -40,11 +39,11 @@ def clear(weight: th.Tensor, mask: th.Tensor) -> None:
 
 
 class MaskedStorage(LayerStorage):
-    """A layer stored as its dense weight, 0 where inactive, and a boolean mask.
+    """Keeps a layer as its dense weight, 0 where inactive, and a boolean mask.
 
-    The mask is the buffer ``weight_mask`` of the module and so rides in its state_dict; a float
-    copy that does not is what gradients are multiplied with. Whenever a state_dict is loaded, at
-    any level, the weight is masked again.
+    The mask is the module's buffer ``weight_mask`` and so part of its state_dict. Gradients are
+    multiplied by a float copy, which is not. Loading a state_dict, at any level, masks the weight
+    again.
 
     :param name: dotted name within the policy
     :param module: the Linear or Conv layer; it stays in place
@@ -66,7 +65,7 @@ class MaskedStorage(LayerStorage):
 
     @staticmethod
     def of(module: nn.Module) -> MaskedStorage | None:
-        """The masked layer of a module, if it is one."""
+        """Find the masked storage of a module; None if it has none."""
         for hook in module._load_state_dict_post_hooks.values():
             layer = getattr(hook, "__self__", None)
             if isinstance(layer, MaskedStorage) and layer.module is module:
@@ -75,7 +74,7 @@ class MaskedStorage(LayerStorage):
 
     @staticmethod
     def below(root: nn.Module) -> Iterator[MaskedStorage]:
-        """The masked layers of a module and all within it; those of targets are none."""
+        """Find the masked storage of a module and all modules in it, without targets."""
         return filter(None, map(MaskedStorage.of, root.modules()))
 
     @property
@@ -89,7 +88,7 @@ class MaskedStorage(LayerStorage):
     @property
     def float_mask(self) -> th.Tensor:
         """1.0 where active, else 0.0, in the weight's shape and on its device."""
-        # Not through attribute lookup of nn.Module: this is read for every gradient.
+        # This is read for every gradient, so it bypasses nn.Module's attribute lookup.
         mask = self.module._buffers[FLOAT_MASK_KEY]
         assert mask is not None
         return mask
@@ -103,7 +102,7 @@ class MaskedStorage(LayerStorage):
         return array
 
     def add_target(self, module: Prunable) -> None:
-        """Make ``module`` a target copy of this layer; it takes the weights that the layer has."""
+        """Make ``module`` a target copy of this layer, with the same weights."""
         self._targets.append(module)
         self._hooks += [
             module.register_load_state_dict_pre_hook(_ignore_mask_key),  # type: ignore[no-untyped-call]
@@ -123,7 +122,7 @@ class MaskedStorage(LayerStorage):
             clear(target.weight, self.float_mask)
 
     def set_mask(self, mask: NDArray[np.bool_]) -> None:
-        """Replace the mask and set what it has inactive to 0.
+        """Replace the mask, and set inactive weights to 0.
 
         :param mask: shape ``(size,)`` or the weight's shape
         """
@@ -144,7 +143,7 @@ class MaskedStorage(LayerStorage):
         return (target.weight.detach().cpu().numpy() for target in self._targets)
 
     def apply_mask(self) -> None:
-        """Bring float mask, nnz and weight in line with the boolean mask."""
+        """Bring the float mask, nnz and the weight in line with the boolean mask."""
         mask = self.module.get_buffer(MASK_KEY)
         self.float_mask.copy_(mask)
         self.nnz = int(mask.sum())
@@ -209,7 +208,7 @@ class MaskedStorage(LayerStorage):
         follow_mask(self.weight.grad, dense_grad, before, self.float_mask)
 
     def release(self) -> None:
-        """Take hooks and masks off the modules, for another storage to take over."""
+        """Remove hooks and masks from the modules, before another storage takes over."""
         for hook in self._hooks:
             hook.remove()
         del self.module._buffers[MASK_KEY], self.module._buffers[FLOAT_MASK_KEY]
@@ -237,7 +236,7 @@ class MaskedGradient(GradientMask):
     """Hook on the gradient of a masked layer.
 
     :param layer: the layer
-    :param capturing: whether the dense gradient will be wanted at the next step
+    :param capturing: tells whether the next step needs the dense gradient
     """
 
     def __init__(self, layer: MaskedStorage, capturing: Callable[[], bool]) -> None:
@@ -246,7 +245,7 @@ class MaskedGradient(GradientMask):
 
 
 class AccumulatedGradient(MaskedGradient):
-    """For algorithms that call ``backward()``."""
+    """Masks gradients of algorithms that call ``backward()``."""
 
     def attach(self) -> RemovableHandle:
         weight = self.layer.weight
@@ -268,7 +267,7 @@ class AccumulatedGradient(MaskedGradient):
 
 
 class FunctionalGradient(MaskedGradient):
-    """For algorithms that also use ``torch.autograd.grad``."""
+    """Masks gradients of algorithms that also use ``torch.autograd.grad``."""
 
     def attach(self) -> RemovableHandle:
         handle: RemovableHandle = self.layer.weight.register_hook(weakly(self._hook))  # type: ignore[no-untyped-call]
@@ -284,7 +283,7 @@ class FunctionalGradient(MaskedGradient):
 
     def take(self) -> DenseGradient | None:
         dense_grad = self.dense_grad
-        if self.layer.weight.grad is not None:  # else it stays that of the rollout
+        if self.layer.weight.grad is not None:  # else keep that of the rollout
             self.dense_grad = None
         return dense_grad
 
@@ -295,12 +294,12 @@ def follow_mask(
     old_mask: th.Tensor,
     new_mask: th.Tensor,
 ) -> None:
-    """Bring the gradient that is about to be applied under a mask that has just changed.
+    """Adapt the gradient of the next step to a mask that has just changed.
 
     Grown connections get their dense gradient, scaled as clipping has scaled the others.
 
     :param grad: gradient under the old mask, perhaps clipped; changed in place. None: no step
-    :param dense_grad: the same before masking and clipping; None if nothing can grow
+    :param dense_grad: the gradient before masking and clipping; None if nothing can grow
     :param old_mask: 1.0 or 0.0
     :param new_mask: 1.0 or 0.0
     """

@@ -1,4 +1,4 @@
-"""A network: the layers that share one budget, and the clock of the optimizer that owns them."""
+"""A network: layers that share one budget, and the clock of the optimizer that owns them."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from sb3_sparse.topology import MaskUpdate, TopologyMethod
 
 
 class SparseNetwork:
-    """The layers of one network.
+    """Owns the layers of one network.
 
     :param name: e.g. ``"actor"``
     :param owner: module whose attribute ``optimizer`` moves the network
-    :param prunable: its layers within the budget, by dotted name
-    :param dense_layers: its layers left dense, outside the budget
+    :param prunable: layers within the budget, with their dotted names
+    :param dense_layers: layers left dense, outside the budget
     """
 
     def __init__(
@@ -41,7 +41,7 @@ class SparseNetwork:
         ]
         self.dense_layers = list(dense_layers)
         self.clock = 0
-        """Gradient steps that the owning optimizer has begun."""
+        """Gradient steps begun by the owning optimizer."""
         self.mask_updates = 0
         """Updates so far in which a connection moved."""
         self.churn = 0.0
@@ -51,34 +51,34 @@ class SparseNetwork:
 
     @property
     def optimizer(self) -> th.optim.Optimizer:
-        """The optimizer that owns the network, as it is now."""
+        """The optimizer that owns the network now."""
         optimizer = self.owner.optimizer
         assert isinstance(optimizer, th.optim.Optimizer)
         return optimizer
 
     @property
     def weights(self) -> list[th.Tensor]:
-        """Weights of all Linear and Conv layers, the ones left dense too."""
+        """Weights of all Linear and Conv layers, including those left dense."""
         dense = (module.weight for _, module in self.dense_layers)
         return [*(layer.weight for layer in self.layers), *dense]
 
     @property
     def sparse_layers(self) -> list[LayerStorage]:
-        """Those with connections that are inactive, or may become so."""
+        """Layers with connections that are inactive or may become so."""
         return [layer for layer in self.layers if not layer.always_full]
 
     def remask(self) -> None:
-        """Set to 0 what masks have inactive."""
+        """Set inactive weights to 0."""
         for layer in self.sparse_layers:
             layer.remask()
 
     def notice(self) -> None:
-        """The same, where torch has counted a write since."""
+        """As :meth:`remask`, but only for weights that torch has seen written since."""
         for layer in self.sparse_layers:
             layer.notice()
 
     def trust(self) -> None:
-        """What torch has counted just now kept to the masks, as an optimizer's step does."""
+        """Note that the writes counted so far kept inactive weights at 0."""
         for layer in self.sparse_layers:
             layer.trust()
 
@@ -103,7 +103,7 @@ class SparseNetwork:
 
     @property
     def denser(self) -> bool:
-        """Whether a layer still has more connections than the requested sparsity leaves it."""
+        """Whether a layer has more connections than the requested sparsity allows."""
         return any(layer.nnz > layer.final_nnz and not layer.frozen for layer in self.layers)
 
     def initialise(
@@ -114,14 +114,14 @@ class SparseNetwork:
         seed: int,
         gains: dict[str, float] | None,
     ) -> None:
-        """Draw masks and, if asked, weights; a network that starts dense is left untouched.
+        """Draw masks and, if asked, weights; a network that starts dense stays untouched.
 
-        :param sparsity: what it shall have in the end, in [0, 1)
-        :param initial_sparsity: what it starts with, at most ``sparsity``
+        :param sparsity: sparsity at the end of training, in [0, 1)
+        :param initial_sparsity: sparsity at the start, at most ``sparsity``
         :param distribution: a name of :mod:`sb3_sparse.sparsity.distributions`
         :param seed: mask seed
-        :param gains: SB3's gain of each layer by name, to redraw the weights by the fans that are
-            there; None keeps SB3's own weights, masked
+        :param gains: SB3's gain of each layer by name, to redraw the weights by their active fans;
+            None keeps SB3's own weights, masked
         """
         shapes = [layer.shape for layer in self.layers]
         final = active_counts(shapes, sparsity, distribution)
@@ -131,7 +131,7 @@ class SparseNetwork:
             layer.initial_nnz = max(initial_nnz, final_nnz)
             if initial_sparsity == 0.0:
                 continue
-            assert isinstance(layer, MaskedStorage)  # every network begins so
+            assert isinstance(layer, MaskedStorage)  # every network starts masked
             mask = random_mask(layer.shape, layer.initial_nnz, seed, layer.name)
             layer.set_mask(mask)
             if gains is not None:
@@ -142,10 +142,10 @@ class SparseNetwork:
     def to_sparse(
         self, names: Container[str] | None, optimizers: Sequence[th.optim.Optimizer]
     ) -> None:
-        """Store linear layers as their active connections from now on.
+        """Move linear layers to sparse storage.
 
-        :param names: which; None: all
-        :param optimizers: whose moments follow
+        :param names: names of the layers; None: all
+        :param optimizers: optimizers whose moments follow
         """
         self.layers = [
             to_sparse(layer, optimizers) if names is None or layer.name in names else layer
@@ -153,7 +153,10 @@ class SparseNetwork:
         ]
 
     def to_masked(self, optimizers: Sequence[th.optim.Optimizer]) -> None:
-        """Store every layer masked from now on."""
+        """Move every layer to masked storage.
+
+        :param optimizers: optimizers whose moments follow
+        """
         self.layers = [
             layer.to_masked(optimizers) if isinstance(layer, SparseStorage) else layer
             for layer in self.layers
@@ -163,17 +166,17 @@ class SparseNetwork:
         """Whether masks move at that gradient step.
 
         :param plan: None: they never move
-        :param step: of the optimizer that owns the network, from 1
+        :param step: gradient step of the owning optimizer, from 1
         :param progress: environment steps done / planned
         """
         return plan is not None and (plan.due(step, progress) or self.must_finish(plan, progress))
 
     def must_finish(self, plan: Plan, progress: float) -> bool:
-        """Whether a plan has ended, and the network is still denser than it shall be."""
+        """Whether a plan has ended while the network is still too dense."""
         return plan.topology.reaches_final and progress >= plan.end and self.denser
 
     def wants_gradients(self, plan: Plan | None, progress: float) -> bool:
-        """Whether dense gradients of the next gradient step are wanted."""
+        """Whether the next gradient step needs dense gradients."""
         return (
             plan is not None
             and plan.wants_gradients
@@ -181,7 +184,7 @@ class SparseNetwork:
         )
 
     def take_gradients(self) -> dict[str, DenseGradient | None]:
-        """Dense gradients of the step that is about to happen, by layer name."""
+        """Hand over the dense gradients of the next step, by layer name."""
         hooked = ((layer.name, layer.gradient) for layer in self.layers)
         return {name: gradient.take() for name, gradient in hooked if gradient is not None}
 
@@ -194,14 +197,14 @@ class SparseNetwork:
         soft_targets: bool,
         at_once: bool,
     ) -> None:
-        """Move the masks of all layers that are trained.
+        """Move the masks of all trained layers.
 
-        :param method: says what to exchange
-        :param update: when it is
+        :param method: chooses the exchange
+        :param update: time and extent of the update
         :param gradients: dense gradients by layer name
-        :param optimizers: whose moments follow
+        :param optimizers: optimizers whose moments follow
         :param soft_targets: whether targets follow at once
-        :param at_once: whether the gradients are those of the step that is about to be taken
+        :param at_once: whether the gradients are those of the next step
         """
         nnz = self.nnz
         dropped = grown = 0

@@ -1,4 +1,4 @@
-"""Optimizers with the settings that masked training wants."""
+"""Optimizer settings for masked training."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ FUSED_BY_DEFAULT = (th.optim.Adam, th.optim.AdamW)
 
 
 def check_weight_decay(weight_decay: float, optimizer_kwargs: Mapping[str, Any] | None) -> float:
-    """Return ``weight_decay`` as a float.
+    """Validate ``weight_decay`` and return it as a float.
 
-    :raises ConfigError: if it is negative or no number, or if the optimizer was given one as well
+    :raises ConfigError: if it is negative, not a number, or given to the optimizer as well
     """
     if not is_number(weight_decay):
         raise ConfigError(f"weight_decay must be a number, 0 or more, got {weight_decay!r}")
@@ -35,11 +35,11 @@ def check_weight_decay(weight_decay: float, optimizer_kwargs: Mapping[str, Any] 
 
 
 def prefer_fused(optimizer: th.optim.Optimizer) -> None:
-    """Let Adam, before its first step, use torch's fused implementation, and change nothing else.
+    """Select torch's fused implementation of Adam before its first step, and change nothing else.
 
     Eager Adam takes square roots of second moments, which are slow on the exact zeros of a masked
-    weight. A group whose ``fused``, ``foreach``, ``capturable`` or ``differentiable`` the user has
-    chosen stays as it is, and so does every other optimizer.
+    weight. Groups whose ``fused``, ``foreach``, ``capturable`` or ``differentiable`` the user has
+    set stay unchanged, as do other optimizers.
     """
     if type(optimizer) not in FUSED_BY_DEFAULT or optimizer.state:
         return
@@ -50,11 +50,11 @@ def prefer_fused(optimizer: th.optim.Optimizer) -> None:
 
 
 def acts_elementwise(optimizer: th.optim.Optimizer) -> bool:
-    """Whether active weights move the same without the inactive ones beside them, which stay 0.
+    """Whether the optimizer moves active weights alike with and without inactive ones.
 
-    Found by trial: three steps of a copy on a 4x6 matrix with zeros, and on its other entries as a
-    vector. Adam, SGD and RMSprop act so. Adafactor and Muon, whose steps depend on rows and
-    columns, and optimizers that add noise do not; nor does one that refuses such a trial.
+    This is tried out: three steps of a copy on a 4x6 matrix with zeros, and on its other entries as
+    a vector. Adam, SGD and RMSprop pass. Adafactor and Muon, whose steps depend on rows and
+    columns, optimizers that add noise and those that fail on such weights do not.
     """
     active = th.arange(24).view(4, 6) % 3 > 0
     start = th.linspace(-1.0, 1.0, 24).view(4, 6) * active
@@ -64,7 +64,7 @@ def acts_elementwise(optimizer: th.optim.Optimizer) -> bool:
             matrix, memory = _trial(optimizer, start, lambda step: (start + step).sin() * active)
             th.manual_seed(0)
             vector, _ = _trial(optimizer, start[active], lambda step: (start[active] + step).sin())
-    except Exception:  # whatever it misses, it does not take a weight as a plain vector
+    except Exception:  # for any reason: it does not take a weight as a plain vector
         return False
     return (
         th.allclose(matrix[active], vector, rtol=1e-4, atol=1e-7)
@@ -76,7 +76,7 @@ def acts_elementwise(optimizer: th.optim.Optimizer) -> bool:
 def _trial(
     optimizer: th.optim.Optimizer, start: th.Tensor, grad: Callable[[int], th.Tensor]
 ) -> tuple[th.Tensor, list[th.Tensor]]:
-    """Three steps of a copy of the optimizer from ``start``, and what it remembers then."""
+    """Take three steps with a copy of the optimizer; give the parameter and its moments."""
     parameter = nn.Parameter(start.clone())
     copied = copy.copy(optimizer)
     copied.state = defaultdict(dict)
@@ -94,7 +94,7 @@ def _trial(
 def keep_implementation(
     optimizer: th.optim.Optimizer, state_dict: dict[str, Any]
 ) -> dict[str, Any]:
-    """Pre-load hook: a state saved by an eager optimizer does not turn a fused one eager."""
+    """Pre-load hook: keep a fused optimizer fused when the saved one was not."""
     if "fused" not in optimizer.defaults:
         return state_dict
     fused = optimizer.defaults["fused"]
@@ -105,8 +105,8 @@ def keep_implementation(
 def add_weight_decay(weights: Iterable[th.Tensor], weight_decay: float) -> None:
     """Coupled L2: add ``weight_decay * weight`` to the gradient of every weight that has one.
 
-    Before the step and after any clipping, as optimizers with a ``weight_decay`` of their own do
-    it, but for weights only and whatever the optimizer.
+    It applies before the step and after clipping, like the ``weight_decay`` of torch's optimizers,
+    but to weights only and with every optimizer.
     """
     with th.no_grad():
         for tensor in weights:

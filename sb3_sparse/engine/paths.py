@@ -1,4 +1,4 @@
-"""Feed-forward networks as what the kernels know of them: linear layers and activations."""
+"""Feed-forward networks as sequences of linear layers and activations."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from sb3_sparse.engine.activations import ACTIVATIONS
 from sb3_sparse.engine.linear import SparseLinear
 
 Paths = Sequence[Sequence[nn.Module]]
-"""Modules of each network in the order of computation."""
+"""The modules of each network, in the order of computation."""
 OWN = ("torch.nn.", "sb3_sparse.engine.")
-"""Where a ``Sequential`` that calls its parts in turn is defined; one of the user's may do more."""
+"""Modules that define a plain ``Sequential``; a user's subclass may do more than call its parts."""
 
 
 def parts_of(path: Iterable[nn.Module]) -> list[tuple[nn.Linear, nn.Module | None]] | None:
-    """Layers, each with its activation; None if there is anything else."""
+    """Split a path into layers, each with its activation; None if it has any other module."""
     parts: list[tuple[nn.Linear, nn.Module | None]] = []
     for module in _leaves(path):
         if type(module) in (nn.Linear, SparseLinear):
@@ -38,6 +38,6 @@ def _leaves(path: Iterable[nn.Module]) -> Iterable[nn.Module]:
 
 
 def modules_of(paths: Paths) -> list[nn.Module]:
-    """Every module on the paths, once."""
+    """Find every module on the paths, once."""
     found = (inner for path in paths for module in path for inner in module.modules())
     return list({id(module): module for module in found}.values())

@@ -1,4 +1,4 @@
-"""Whether sparse layers are still where they were found."""
+"""Checks that sparse layers are still in their policy."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from sb3_sparse.errors import UnsupportedError
 
 
 def check_places(root: nn.Module, layers: Iterable[LayerStorage]) -> None:
-    """Refuse a policy in which a sparse layer was replaced by another module.
+    """Reject a policy in which a sparse layer has been replaced by another module.
 
     :param root: the policy
     :param layers: its sparse layers
-    :raises UnsupportedError: if one was
+    :raises UnsupportedError: if one has been replaced, or has lost its mask
     """
     for layer in layers:
         if _module_at(root, layer.name) is not layer.module:
@@ -35,7 +35,7 @@ def check_places(root: nn.Module, layers: Iterable[LayerStorage]) -> None:
 
 
 def _module_at(root: nn.Module, name: str) -> nn.Module | None:
-    """What stands at a dotted name, also within modules that ``torch.compile`` has wrapped."""
+    """Find the module at a dotted name, also within modules that ``torch.compile`` has wrapped."""
     module: nn.Module | None = root
     for part in name.split("."):
         module = None if module is None else module._modules.get(part)

@@ -1,4 +1,4 @@
-"""Modules as torch and SB3 know them: dense weights, and nothing of ours on them."""
+"""Turns sparse modules into plain ones."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ from sb3_sparse.engine.sequential import ChainedSequential, unchain
 
 
 def make_plain(root: nn.Module) -> None:
-    """Give every layer below ``root``, a copy, its dense weight, 0 where inactive.
+    """Give every layer below ``root`` its dense weight, 0 where inactive.
 
-    Masks, hooks and classes of ours are gone afterwards. Optimizers do not follow.
+    This removes the masks, hooks and classes of this package. Optimizers do not follow, so apply it
+    to copies.
     """
     for module in root.modules():
         if isinstance(module, ChainedSequential):

@@ -1,4 +1,4 @@
-"""When masks move and how far: what a user configures, checked when made."""
+"""The schedule of mask updates, validated on creation."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ UPDATE_ON = ("step", "rollout")
 
 @dataclass(frozen=True)
 class Plan:
-    """The schedule of one method.
+    """Schedules the mask updates of one method.
 
     :param method: a registered name
     :param update_interval: gradient steps of a network's own optimizer between two updates
     :param drop_fraction: share of a layer's connections exchanged at the first update, in [0, 1]
     :param begin: progress (environment steps done / planned) at which updates begin
-    :param end: progress at which they end
-    :param update_on: ``"step"``: at the gradient step that is due; ``"rollout"``: at the next start
-        of a rollout
-    :raises ConfigError: for a value that is not allowed
+    :param end: progress at which updates end
+    :param update_on: ``"step"``: at the gradient step itself; ``"rollout"``: at the next start of a
+        rollout
+    :raises ConfigError: for an invalid value
     """
 
     method: str
@@ -54,36 +54,36 @@ class Plan:
 
     @property
     def topology(self) -> TopologyMethod:
-        """The method itself."""
+        """The registered method."""
         return method_named(self.method)
 
     @property
     def wants_gradients(self) -> bool:
-        """Whether an update needs dense gradients, be it for what it grows."""
+        """Whether an update needs dense gradients, for its scores or for grown connections."""
         return self.topology.grows or self.topology.needs_gradient
 
     def update_at(self, step: int, progress: float, seed: int) -> MaskUpdate:
-        """The update that a method receives."""
+        """Describe an update at a gradient step to the method."""
         return MaskUpdate(step, progress, self.begin, self.end, self.drop_fraction, seed)
 
     def drop_fraction_at(self, progress: float) -> float:
-        """The drop fraction now; 0 for a method that exchanges nothing."""
+        """Compute the present drop fraction; 0 for a method that exchanges nothing."""
         if not self.topology.grows:
             return 0.0
         return cosine_drop_fraction(progress, self.drop_fraction, self.end)
 
     def due(self, step: int, progress: float) -> bool:
-        """Whether the schedule has an update at this gradient step."""
+        """Whether an update is due at this gradient step."""
         return step % self.update_interval == 0 and self.begin <= progress < self.end
 
 
 def warn_of_no_plan(sparsity: float) -> None:
-    """Say that a policy that began denser than was asked for stays so.
+    """Warn that a policy trains at a lower sparsity than requested, and stays there.
 
-    :param sparsity: what it has now
+    :param sparsity: its present sparsity
     """
     warn(
-        f"the policy trains at sparsity {sparsity:.3g}, denser than was asked for, and nothing "
-        "takes it further: pass SparsityCallback('prune') to learn(), or leave initial_sparsity "
-        "out to begin at the sparsity asked for"
+        f"the policy trains at sparsity {sparsity:.3g}, denser than requested, and nothing prunes "
+        "it: pass SparsityCallback('prune') to learn(), or leave out "
+        "initial_sparsity to start at the requested sparsity"
     )

@@ -1,4 +1,4 @@
-"""What the kernels compute, for autograd: a batch through a chain of layers and back.
+"""Forward and backward passes through a chain of layers, for autograd.
 
 Between the layers of a chain, and across elementwise activations to the next chain, activations
 stay in tiles: ``[ceil(batch / 64), features, 64]``.
@@ -23,7 +23,7 @@ from sb3_sparse.errors import UnsupportedError
 
 TILE = 64
 
-# Whatever torch's defaults are: the kernels read and write this and nothing else.
+# The kernels read and write float32 on the CPU, whatever torch's defaults are.
 _empty = partial(th.empty, dtype=th.float32, device="cpu")
 
 
@@ -177,7 +177,7 @@ class ChainPass(NamedTuple):
         return [grad_x, *grads]
 
     def _widths(self) -> list[int]:
-        """Features of what the workspace holds: the input and each output, but what is tiled."""
+        """Features of each array in the workspace: input and outputs without those in tiles."""
         widths = [self.columns, *(structure.shape[0] for structure in self.structures)]
         return widths[1 if self.tiled_in else 0 : -1 if self.tiled_out else None]
 
@@ -190,7 +190,7 @@ class ChainPass(NamedTuple):
         return ([x, *shaped] if self.tiled_in else shaped)[: len(self.structures)]
 
     def by_dense_weights(self, x: th.Tensor, parameters: Sequence[Any]) -> th.Tensor:
-        """The same result by dense weights, which torch differentiates as often as one likes."""
+        """Compute the same result by dense weights, which torch can differentiate repeatedly."""
         if self.tiled_in:
             x = x.transpose(1, 2).reshape(-1, self.columns)[: self.batch]
         for i, structure in enumerate(self.structures):
@@ -198,7 +198,7 @@ class ChainPass(NamedTuple):
             flat = th.from_numpy(structure.flat)
             values = parameters[2 * i]
             if th.onnx.is_in_onnx_export():
-                # Its tracer knows the dense weights of the state_dict, not these values.
+                # The tracer knows the dense weights of the state_dict, not these values.
                 values = values.data
             weight = values.new_zeros(rows * columns).index_put((flat,), values)
             x = functional.linear(x, weight.view(rows, columns), parameters[2 * i + 1])
@@ -211,7 +211,7 @@ class ChainPass(NamedTuple):
 
 
 class Products(th.autograd.Function):
-    """A chain on a batch, differentiable by its input, values and biases."""
+    """Applies a chain to a batch, differentiable by its input, values and biases."""
 
     @staticmethod
     def forward(ctx: Any, how: ChainPass, x: th.Tensor, *parameters: Any) -> th.Tensor:
@@ -228,7 +228,7 @@ class Products(th.autograd.Function):
         how: ChainPass = ctx.how
         x, work, _, *parameters = ctx.saved_tensors
         needs = ctx.needs_input_grad[1:]
-        # The gradient shall itself be differentiable (TRPO asks for it), or is many at once.
+        # TRPO needs a differentiable gradient, and torch.func several at once.
         again = th.is_grad_enabled()
         if again or stands_for_many(gradients[0]):
             with th.enable_grad():
@@ -250,7 +250,7 @@ class Products(th.autograd.Function):
 
 
 def _outer(output_grad: th.Tensor, x: th.Tensor, batch: int) -> th.Tensor:
-    """Dense gradient of a layer's weight, from tiles of its output's gradient and its input."""
+    """Compute a weight's dense gradient from tiles of its layer's output gradient and input."""
     total = x.new_zeros(output_grad.shape[1], x.shape[1])
     for t in range(len(x)):
         entries = min(TILE, batch - t * TILE)

@@ -24,12 +24,12 @@ UNSUPPORTED_TYPES = (
 def find_prunable(
     root: nn.Module, prefix: str, stays_dense: Callable[[str], bool]
 ) -> Iterator[tuple[str, Prunable]]:
-    """Every Linear and Conv layer below ``root``, in the order of its modules.
+    """Find every Linear and Conv layer below ``root``, in module order.
 
     :param root: module to search
     :param prefix: dotted name of ``root``
-    :param stays_dense: whether the user asked to leave the layer of that name dense
-    :raises UnsupportedError: for a layer with weights that can be neither masked nor overlooked
+    :param stays_dense: whether the user wants the layer of that name dense
+    :raises UnsupportedError: for a layer whose weights cannot be masked and shall not stay dense
     """
     for name, module in root.named_modules(prefix=prefix):
         if isinstance(module, UNSUPPORTED_TYPES) and not stays_dense(name):
@@ -43,9 +43,9 @@ def find_prunable(
 
 
 def check_plain(module: nn.Module, name: str) -> None:
-    """Refuse a layer whose weight is no Parameter of its own.
+    """Reject a layer whose weight is computed from other parameters.
 
-    :raises UnsupportedError: if it is computed from others
+    :raises UnsupportedError: if so
     """
     if not isinstance(module._parameters.get("weight"), nn.Parameter):
         raise UnsupportedError(

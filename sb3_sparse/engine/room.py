@@ -1,4 +1,4 @@
-"""Memory that the kernels fill, and NumPy and torch read."""
+"""Memory that the kernels fill and that NumPy and torch read."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ FLOAT = np.dtype(np.float32)
 
 
 class Room:
-    """Memory for float32 numbers, which lives as long as an array or tensor of it.
+    """Memory for float32 numbers that lives as long as any array or tensor of it.
 
-    It costs a tenth of what it costs torch to make a tensor.
+    Creating it takes a tenth of the time of creating a tensor.
 
-    :param size: how many numbers
+    :param size: count of numbers
     """
 
     def __init__(self, size: int) -> None:
         self.memory = _memory_for(size)()
-        """What ctypes passes to the kernels."""
+        """The ctypes array to pass to the kernels."""
 
     def array(self, shape: tuple[int, ...], start: int = 0) -> NDArray[np.float32]:
-        """The numbers from the ``start``-th on, in this shape."""
+        """View the numbers from the ``start``-th on as an array."""
         array: NDArray[np.float32] = np.ndarray(shape, FLOAT, self.memory, 4 * start)
         return array
 
     def tensor(self, shape: tuple[int, ...], start: int = 0) -> th.Tensor:
-        """The same as a tensor."""
+        """View the numbers from the ``start``-th on as a tensor."""
         return th.from_numpy(self.array(shape, start))
 
 

@@ -16,27 +16,26 @@ from sb3_sparse.engine.kept import KeptInference
 from sb3_sparse.engine.linear import SparseLinear
 
 ELEMENTWISE = (*ACTIVATIONS, nn.Identity)
-"""Activations that may work on tiles as they are."""
+"""Activations that work on tiles unchanged."""
 
 
 class ChainedSequential(nn.Sequential):
     """A ``Sequential`` that runs its sparse layers as chains.
 
-    Whoever hooks one of its modules, or traces them, gets the modules called one by one, as in
-    torch.
+    With hooks on its modules, and under tracing, it calls the modules one by one, as torch does.
     """
 
     _seen: tuple[nn.Module, ...]
     _steps: list[tuple[Any, bool, bool]]
     _adjustable: list[nn.Module]
-    """Activations within the chains whose parameters may be set anew."""
+    """Activations within the chains whose parameters the user may change."""
     _kept: KeptInference
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_seen": (), "_steps": [], "_adjustable": []}
 
     def forward(self, input: th.Tensor) -> th.Tensor:
-        """As of ``Sequential``."""
+        """Apply the modules in turn, as ``Sequential`` does."""
         if not th.is_grad_enabled() and not by_modules(input):
             results = self._inferred(input)
             if results is not None:
@@ -71,7 +70,7 @@ class ChainedSequential(nn.Sequential):
 
 
 def _steps(modules: Sequence[Any]) -> list[tuple[Any, bool, bool]]:
-    """Chains and single modules, and whether a chain's input and output are in tiles."""
+    """Group modules into chains and others; tell whether a chain's input and output are tiles."""
     groups: list[Any] = []
     for module in modules:
         last = groups[-1] if groups else None
@@ -99,19 +98,19 @@ def _steps(modules: Sequence[Any]) -> list[tuple[Any, bool, bool]]:
 
 
 def chain_up(root: nn.Module) -> None:
-    """Let every ``Sequential`` below ``root`` that has sparse layers run them as chains."""
+    """Make every ``Sequential`` below ``root`` run its sparse layers as chains."""
     for module in root.modules():
         if type(module) not in (nn.Sequential, ChainedSequential):
             continue
         if any(isinstance(child, SparseLinear) for child in module.children()):
             become(module, ChainedSequential)
-            # More of them may be sparse now.
+            # More layers may be sparse now.
             vars(module).update(_seen=(), _steps=[], _adjustable=[], _kept=KeptInference())
         elif type(module) is ChainedSequential:
             unchain(module)
 
 
 def unchain(module: ChainedSequential) -> None:
-    """Make it a plain ``Sequential`` again, in place."""
+    """Turn it into a plain ``Sequential`` again, in place."""
     del module._seen, module._steps, module._adjustable, module._kept
     become(module, nn.Sequential)

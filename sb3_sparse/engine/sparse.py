@@ -1,4 +1,4 @@
-"""The second storage: the active connections only."""
+"""Sparse storage: the active connections only."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from sb3_sparse.errors import UnsupportedError
 
 
 class SparseStorage(LayerStorage):
-    """A linear layer stored as the values of its active connections and their indices.
+    """Keeps a linear layer as the values and indices of its active connections.
 
-    :param layer: the same layer, masked; it is taken apart
-    :param optimizers: whose moments of the weight shall follow
+    :param layer: the layer in masked storage, which is released
+    :param optimizers: optimizers whose moments of the weight follow
     """
 
     module: SparseLinear
@@ -35,7 +35,7 @@ class SparseStorage(LayerStorage):
         self.nnz = layer.nnz
         structure = Structure.of_mask(layer.mask(), (self.shape[0], self.shape[1]))
         self._structure = structure
-        """What targets and moments go by; differs from the module's after a load."""
+        """The structure that targets and moments fit; after a load the module has another."""
         layer.release()
         self.module = SparseLinear.convert(layer.module, structure, is_target=False)
         self.module.check_mask = self.check_mask
@@ -70,16 +70,16 @@ class SparseStorage(LayerStorage):
             target.take(self.module.structure, target.dense())
 
     def remask(self) -> None:
-        """There is nothing inactive to set to 0."""
+        """Do nothing: inactive weights are not stored."""
 
     def mask_gradient(self) -> None:
-        """There is none of what is inactive."""
+        """Do nothing: inactive weights have no gradient."""
 
     def write(self, dense: th.Tensor) -> None:
         self.module.take(self.module.structure, dense)
 
     def settle_targets(self, soft: bool) -> None:
-        if any(target.snapshot is not None for target in self._targets):  # else they fit already
+        if any(target.snapshot is not None for target in self._targets):  # else they fit
             super().settle_targets(soft)
 
     def _dense_targets(self) -> Iterable[NDArray[np.float32]]:
@@ -128,9 +128,9 @@ class SparseStorage(LayerStorage):
         return dense.view(self.shape)
 
     def to_masked(self, optimizers: Sequence[th.optim.Optimizer]) -> MaskedStorage:
-        """The same layer in masked storage; this one is taken apart.
+        """Move the layer to masked storage; this object must not be used afterwards.
 
-        :param optimizers: whose moments of the weight shall follow
+        :param optimizers: optimizers whose moments of the weight follow
         """
         mask = self.mask()
         for state, key, value in moments_of(optimizers, self.weight):
@@ -190,10 +190,12 @@ class SparseStorage(LayerStorage):
 
 
 class SparseStorageGradient(GradientMask):
-    """Hears of a sparse layer's dense gradient while the kernels go back through it.
+    """Takes a sparse layer's dense gradient from the kernels' backward pass.
 
-    :param functional: whether the algorithm uses ``torch.autograd.grad``: the first gradient is the
-        one wanted then, else the last
+    :param layer: the layer
+    :param functional: whether the algorithm uses ``torch.autograd.grad``; if so, the first gradient
+        counts, otherwise the last
+    :param capturing: tells whether the next step needs the dense gradient
     """
 
     def __init__(
@@ -210,11 +212,11 @@ class SparseStorageGradient(GradientMask):
         return weight.register_post_accumulate_grad_hook(weakly(self._arrived))
 
     def wanted(self) -> bool:
-        """Whether the next step may move the mask."""
+        """Whether the next step needs the dense gradient, and it is not there yet."""
         return self.capturing() and not (self.functional and self.dense_grad is not None)
 
     def note(self, dense_grad: DenseGradient) -> None:
-        """Keep a dense gradient; several of one backward pass add up."""
+        """Keep a dense gradient; those of one backward pass add up."""
         if self.functional:
             self.dense_grad = dense_grad
         else:
@@ -223,14 +225,14 @@ class SparseStorageGradient(GradientMask):
     def _arrived(self, weight: th.Tensor) -> None:
         if self._arriving:
             assert weight.grad is not None
-            # What is active may have been added to an earlier backward pass.
+            # The gradient may include that of an earlier backward pass.
             active, flat = weight.grad.clone(), self.layer.module.structure.flat
             self.dense_grad = partial(_added_up, self._arriving, active, th.from_numpy(flat))
             self._arriving = []
 
     def take(self) -> DenseGradient | None:
         dense_grad, stepping = self.dense_grad, self.layer.weight.grad is not None
-        if stepping or not self.functional:  # else it stays that of the rollout
+        if stepping or not self.functional:  # else keep that of the rollout
             self.dense_grad = None
         return dense_grad if stepping or self.functional else None
 
@@ -244,7 +246,7 @@ def _added_up(parts: list[DenseGradient], active: th.Tensor, flat: th.Tensor) ->
 
 
 def _carried(after: Structure, before: Structure) -> Callable[[th.Tensor], th.Tensor]:
-    """A function that takes values of one structure to another: what is new there is 0."""
+    """Make a function that carries values from one structure to another; new ones are 0."""
     places = th.from_numpy(after.places_in(before))
     kept = places >= 0
     places.clamp_(min=0)
@@ -262,7 +264,7 @@ def _followed(
     after: Structure,
     carried: Callable[[th.Tensor], th.Tensor],
 ) -> th.Tensor:
-    """As :func:`~sb3_sparse.engine.gradients.follow_mask`, on the values."""
+    """As :func:`~sb3_sparse.engine.masked.follow_mask`, on values."""
     moved = carried(grad)
     if dense_grad is None:
         return moved
@@ -275,7 +277,7 @@ def _followed(
 
 
 def to_sparse(layer: LayerStorage, optimizers: Sequence[th.optim.Optimizer]) -> LayerStorage:
-    """The layer in sparse storage; one that is not linear, or sparse already, as it is."""
+    """Move a linear layer to sparse storage; give others, and sparse ones, back unchanged."""
     if isinstance(layer, MaskedStorage) and type(layer.module) is nn.Linear:
         return SparseStorage(layer, optimizers)
     return layer

@@ -20,7 +20,7 @@ from sb3_sparse.topology import Exchange
 
 
 class LayerStorage(ABC):
-    """A layer of a network within its budget.
+    """Base class of storages: keeps the connections of one layer within a budget.
 
     :param name: dotted name within the policy
     :param module: the Linear or Conv layer; it stays in place
@@ -36,12 +36,12 @@ class LayerStorage(ABC):
         self.initial_nnz = self.size
         self.final_nnz = self.size
         self.moments_stale = False
-        """Whether an optimizer may remember what does not fit the mask."""
+        """Whether an optimizer's moments may not fit the mask."""
         self.gradient: GradientMask | None = None
-        """Hook on the weight's gradient; None while the weight is frozen or has no hook."""
+        """The hook on the weight's gradient; None if there is none, as for frozen weights."""
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "gradient": None}  # a copy gets its own when it is hooked
+        return {**self.__dict__, "gradient": None}  # hooks are registered anew on a copy
 
     @property
     def weight(self) -> nn.Parameter:
@@ -59,23 +59,23 @@ class LayerStorage(ABC):
 
     @property
     def always_full(self) -> bool:
-        """Whether every connection is active, and stays so."""
+        """Whether every connection is active for good."""
         return self.nnz == self.size == self.final_nnz
 
     @property
     def frozen(self) -> bool:
-        """Whether the weight is not trained, so that its connections stay where they are."""
+        """Whether the weight is not trained, so that its connections do not move."""
         return not self.weight.requires_grad
 
     @property
     @abstractmethod
     def targets(self) -> Sequence[Prunable]:
-        """Target copies of the layer."""
+        """The layer's copies in target networks."""
 
     @property
     @abstractmethod
     def is_sparse(self) -> bool:
-        """Whether only active connections are stored and computed."""
+        """Whether the layer stores and computes its active connections only."""
 
     @abstractmethod
     def mask(self) -> NDArray[np.bool_]:
@@ -87,30 +87,30 @@ class LayerStorage(ABC):
 
     @abstractmethod
     def mask_targets(self) -> None:
-        """Set to 0 what the mask has inactive in every target."""
+        """Set inactive weights of every target to 0."""
 
     @abstractmethod
     def remask(self) -> None:
-        """Set to 0 what the mask has inactive, after somebody wrote the weight."""
+        """Set inactive weights to 0, in case the weight has been written."""
 
     def notice(self) -> None:
-        """As :meth:`remask`, but only if torch has counted a write since; cheap where it has not.
+        """As :meth:`remask`, but only if torch has counted a write since, which is cheap to check.
 
-        A write through ``.data`` or NumPy is not counted.
+        Torch does not count writes through ``.data`` or NumPy.
         """
         self.remask()
 
     def trust(self) -> None:
-        """What torch has counted just now kept to the mask, as an optimizer's step does."""
+        """Note that the writes counted so far kept inactive weights at 0."""
         return None
 
     @abstractmethod
     def mask_gradient(self) -> None:
-        """Set to 0 what the mask has inactive in a gradient that came while no hook was on it."""
+        """Set the gradient of inactive weights to 0, in case it has been written."""
 
     @abstractmethod
     def write(self, dense: th.Tensor) -> None:
-        """Replace the active weights; what is inactive stays 0.
+        """Replace the active weights; inactive ones stay 0.
 
         :param dense: as many elements as the dense weight
         """
@@ -118,8 +118,8 @@ class LayerStorage(ABC):
     def settle_targets(self, soft: bool) -> None:
         """Bring the targets in line with the mask.
 
-        :param soft: whether they follow it at once. A hard target may keep the connections that it
-            had at its last copy, but never more than the layer had at any time.
+        :param soft: whether targets follow the mask at once. A hard target may keep the connections
+            of its last copy, but never more than the layer ever had.
         """
         most = max(self.nnz, self.initial_nnz)
         if soft or any(np.count_nonzero(dense) > most for dense in self._dense_targets()):
@@ -127,14 +127,14 @@ class LayerStorage(ABC):
 
     @abstractmethod
     def _dense_targets(self) -> Iterable[NDArray[np.float32]]:
-        """The dense weights of each target."""
+        """Give the dense weights of each target."""
 
     def check_mask(self, mask: th.Tensor) -> None:
-        """Refuse a saved mask of another sparsity.
+        """Reject a saved mask of another sparsity.
 
         :param mask: as many elements as the dense weight, True where active
-        :raises CorruptStateError: if it has fewer connections than the layer ends with, or more
-            than it starts with
+        :raises CorruptStateError: if it has fewer connections than the layer at the end of training
+            or more than at its start
         """
         count = int(mask.count_nonzero())
         if not self.final_nnz <= count <= self.initial_nnz:
@@ -155,10 +155,10 @@ class LayerStorage(ABC):
         self.settle_targets(soft=False)
 
     def hook_gradient(self, functional: bool, capturing: Callable[[], bool]) -> RemovableHandle:
-        """Keep gradients true to the mask from now on.
+        """Mask each gradient on arrival from now on.
 
         :param functional: whether the algorithm uses ``torch.autograd.grad``
-        :param capturing: whether the dense gradient will be wanted at the next step
+        :param capturing: tells whether the next step needs the dense gradient
         """
         self.gradient = self._gradient_mask(functional, capturing)
         return self.gradient.attach()
@@ -167,30 +167,30 @@ class LayerStorage(ABC):
     def _gradient_mask(self, functional: bool, capturing: Callable[[], bool]) -> GradientMask: ...
 
     def note_gradient(self, dense_grad: th.Tensor) -> None:
-        """Hear of the dense gradient at the step that is about to be taken."""
+        """Take the dense gradient of the next step from somebody who has computed it."""
         if self.gradient is not None:
             self.gradient.dense_grad = lambda: dense_grad
 
     @abstractmethod
     def settle_moments(self, optimizers: Sequence[th.optim.Optimizer]) -> None:
-        """Bring what optimizers remember in line with mask and storage."""
+        """Bring the optimizers' moments in line with mask and storage."""
 
     @property
     @abstractmethod
     def connections(self) -> object:
-        """Another object each time the mask or its storage has changed."""
+        """An object that is replaced whenever the mask or the storage changes."""
 
     @abstractmethod
     def follow(self, optimizer: th.optim.Optimizer, since: object) -> None:
-        """Bring what an optimizer of the user's own remembers in line with mask and storage.
+        """Bring the moments of the user's own optimizer in line with mask and storage.
 
-        :param since: :attr:`connections` when it last did
-        :raises UnsupportedError: if what it remembers cannot follow a mask that has moved
+        :param since: :attr:`connections` at the last call
+        :raises UnsupportedError: if the moments cannot follow a mask that has moved
         """
 
     @abstractmethod
     def saved_moment(self, moment: th.Tensor) -> th.Tensor:
-        """What a state_dict shows for something an optimizer remembers of the weight."""
+        """Give a moment of the weight in the form that a state_dict has."""
 
     @abstractmethod
     def _move(
@@ -209,13 +209,13 @@ class LayerStorage(ABC):
         soft_targets: bool = True,
         dense_grad: th.Tensor | None = None,
     ) -> None:
-        """Move connections. Grown ones start at 0, moments too; the gradient follows the mask.
+        """Move connections; weights and moments of grown ones start at 0.
 
-        :param exchange: what to drop (must be active) and to grow (must be inactive)
-        :param optimizers: whose moments of the weight shall follow
+        :param exchange: the connections to drop (must be active) and to grow (must be inactive)
+        :param optimizers: optimizers whose moments of the weight follow
         :param soft_targets: whether targets follow at once or keep their snapshot
-        :param dense_grad: dense gradient of the step that is about to be taken, before clipping, to
-            give the grown their share; None: they get none
+        :param dense_grad: dense gradient of the next step, before clipping, from which grown
+            connections get theirs; None: theirs is 0
         :raises TopologyError: if the exchange does not fit the mask or would leave it empty
         """
         mask = self.mask()
@@ -241,9 +241,10 @@ class LayerStorage(ABC):
 def moments_of(
     optimizers: Sequence[th.optim.Optimizer], weight: nn.Parameter
 ) -> list[tuple[dict[str, Any], str, th.Tensor]]:
-    """Every tensor with dimensions that an optimizer remembers of ``weight``, and its place.
+    """Find the moments of ``weight``: each with the state and the key under which it is kept.
 
-    Adam's two moments, RMSprop's, a momentum buffer; not the step count.
+    They are the tensors that have dimensions: Adam's two moments, a momentum buffer, but no step
+    count.
     """
     return [
         (state, key, value)
@@ -257,7 +258,7 @@ def moments_of(
 def save_moments(
     optimizer: th.optim.Optimizer, state_dict: dict[str, Any], layers: Iterable[LayerStorage]
 ) -> None:
-    """Show moments of sparse layers in an optimizer's state_dict as those of masked ones."""
+    """Write moments of sparse layers into an optimizer's state_dict as masked layers have them."""
     parameters = [p for group in optimizer.param_groups for p in group["params"]]
     numbers = {id(parameter): number for number, parameter in enumerate(parameters)}
     for layer in layers:
@@ -272,7 +273,7 @@ def save_moments(
 def check_masked(optimizer: th.optim.Optimizer, layers: Iterable[LayerStorage]) -> None:
     """Reject sparse storage under an optimizer that does not move each weight by itself.
 
-    :raises UnsupportedError: if a layer is in sparse storage
+    :raises UnsupportedError: if a layer is sparse
     """
     sparse = next((layer.name for layer in layers if layer.is_sparse), None)
     if sparse is not None:

@@ -1,4 +1,4 @@
-"""Which connections of a weight are active, by rows and by columns."""
+"""The active connections of a weight, by rows and by columns."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from sb3_sparse.errors import CorruptStateError
 Int32 = NDArray[np.int32]
 Int64 = NDArray[np.int64]
 LIMIT = 2**31 - 65
-"""The kernels look up to a tile ahead with 32 bits."""
+"""The kernels index up to a tile ahead with 32 bits."""
 
 
 class Structure:
-    """Compressed-row indices of a ``rows x columns`` weight, and their transpose. Never changes.
+    """Immutable compressed-row indices of a ``rows x columns`` weight, and their transpose.
 
     :param flat: flat indices of the active connections, ascending, shape ``(nnz,)``
     :param shape: ``(rows, columns)``, i.e. outputs and inputs
-    :raises CorruptStateError: if an index lies outside, stands twice or is out of order
+    :raises CorruptStateError: if an index is out of range, repeated or out of order
     """
 
     def __init__(self, flat: NDArray[Any], shape: tuple[int, int]) -> None:
@@ -30,8 +30,8 @@ class Structure:
             flat.size and (flat[0] < 0 or flat[-1] >= rows * columns or (np.diff(flat) <= 0).any())
         ):
             raise CorruptStateError(
-                f"the indices of a {rows}x{columns} layer must ascend from 0 to "
-                f"{rows * columns - 1} and none may stand twice; these do not"
+                f"the indices of a {rows}x{columns} layer must ascend strictly within 0 to "
+                f"{rows * columns - 1}; these do not"
             )
         if max(rows, columns, flat.size) > LIMIT:
             raise CorruptStateError(
@@ -47,12 +47,12 @@ class Structure:
         self.column_start = _starts(column[order], columns)
         self.row: Int32 = row[order].astype(np.int32)
         self.position: Int32 = order.astype(np.int32)
-        """Where each connection of the transpose stands by rows."""
+        """The row-major position of each connection of the transpose."""
         self._addresses: tuple[int, ...] | None = None
 
     @classmethod
     def of_mask(cls, mask: NDArray[Any], shape: tuple[int, int]) -> Structure:
-        """The structure of a mask, True where active, of any shape with as many elements."""
+        """Create the structure of a mask, True where active, of any shape with as many elements."""
         return cls(np.flatnonzero(mask), shape)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Structure:
@@ -68,14 +68,14 @@ class Structure:
 
     @property
     def addresses(self) -> tuple[int, ...]:
-        """Of :attr:`arrays`, for the kernels."""
+        """Addresses of :attr:`arrays`, for the kernels."""
         if self._addresses is None:
             self._addresses = tuple(array.ctypes.data for array in self.arrays)
         return self._addresses
 
     @property
     def nbytes(self) -> int:
-        """Memory of the indices."""
+        """Bytes of the indices."""
         return sum(array.nbytes for array in self.arrays)
 
     @property
@@ -100,7 +100,7 @@ class Structure:
         return mask
 
     def places_in(self, other: Structure) -> Int64:
-        """Where each connection stands in ``other``, -1 for one that is not there."""
+        """Find the position of each connection in ``other``; -1 if it is not there."""
         if not other.nnz:
             return np.full(self.nnz, -1, dtype=np.int64)
         mine, theirs = self.flat, other.flat

@@ -13,12 +13,10 @@ from sb3_sparse.fused.distributions import (
     squashed_gaussian,
 )
 from sb3_sparse.fused.errors import NotCovered
-from sb3_sparse.fused.machine import Machine
 from sb3_sparse.fused.program import Program
 from sb3_sparse.fused.values import Value
 
 __all__ = [
-    "Machine",
     "NotCovered",
     "Program",
     "Value",

@@ -1,4 +1,4 @@
-"""A step down the gradient of a loss: reverse mode, recorded once."""
+"""Records the gradient of a loss and the optimizer's step: reverse-mode differentiation."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from sb3_sparse.fused.values import Value
 
 
 class Descent:
-    """Records gradients, and the step of an optimizer that they are for.
+    """Records the gradients for one step of an optimizer, and the step.
 
-    :param program: records
+    :param program: the program that records them
     :param optimizer: moves those of its parameters that the loss depends on
     """
 
@@ -27,10 +27,10 @@ class Descent:
         self._layers: list[int] = []
 
     def record(self, loss: Value, clip: Value | None) -> None:
-        """All of it.
+        """Record everything.
 
-        :param loss: one number
-        :param clip: greatest norm of the gradient
+        :param loss: a single number
+        :param clip: maximum norm of the gradient; None: no clipping
         """
         program = self._program
         before = program.values[:]
@@ -44,7 +44,7 @@ class Descent:
         self._finish((begin, len(program.slots)), clip)
 
     def _depending(self, values: list[Value]) -> set[Value]:
-        """What the optimizer's parameters have a part in."""
+        """Find the values that depend on the optimizer's parameters."""
         program = self._program
         found = {value for key, value in program.vectors.items() if key in self._wanted}
         for value in values:
@@ -93,7 +93,7 @@ class Descent:
         return (("gradients", id(self._optimizer)),)
 
     def _add(self, parent: Value, g: Value) -> None:
-        """Add to a gradient, summed over what ``parent`` was broadcast to."""
+        """Add to a parent's gradient, summed over the dimensions to which it was broadcast."""
         if g.features > parent.features:
             g = g.sum_features()
         elif g.features < parent.features and parent not in self._program.parts:
@@ -110,7 +110,7 @@ class Descent:
         self._grads[parent] = g
 
     def _export(self) -> None:
-        """Gradients of vectors of parameters to where the optimizer looks for them."""
+        """Move gradients of parameter vectors to where the optimizer reads them."""
         program = self._program
         for key, value in program.vectors.items():
             if key in self._wanted and value in self._grads:
@@ -131,7 +131,7 @@ class Descent:
             program.record("CLIP_NORM", Value(program, 1, False), clip, **common)
         step = program.record("OPTIMIZE", None, **common, changes=True)
         program.minimised.append(Minimised(self._optimizer, slots, step, self._captured))
-        # A loss to come reads them anew.
+        # A later loss must read them again.
         program.turned.difference_update(self._layers)
         for key in self._wanted:
             program.vectors.pop(key, None)

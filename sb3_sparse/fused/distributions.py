@@ -1,4 +1,4 @@
-"""Distributions of actions, written with values of a program."""
+"""Distributions of actions, in terms of values of a program."""
 
 from __future__ import annotations
 
@@ -8,28 +8,40 @@ from collections.abc import Sequence
 from sb3_sparse.fused.values import Value
 
 LARGEST = 3.4028234663852886e38
-"""Of the numbers of single precision."""
+"""The largest float32."""
 LOG_OF_ROOT_OF_TWO_PI = 0.5 * math.log(2.0 * math.pi)
 
 
 def squashed_gaussian(
     mean: Value, log_std: Value, noise: Value, epsilon: float
 ) -> tuple[Value, Value]:
-    """A sample of a Gaussian behind a tanh, and its log probability.
+    """Sample a Gaussian and squash it by tanh; give the action and its log probability.
 
-    :param noise: of a standard normal distribution
+    Example::
+
+        from sb3_sparse.fused import Program, squashed_gaussian
+
+        program = Program()
+        mean, log_std, noise = (program.input(name, 6) for name in ("mean", "log_std", "noise"))
+        action, log_prob = squashed_gaussian(mean, log_std, noise, epsilon=1e-6)
+
+    :param mean: means, ``[batch, dim]``
+    :param log_std: logarithms of the standard deviations, ``[batch, dim]``
+    :param noise: standard normal, ``[batch, dim]``
     :param epsilon: keeps the logarithm of the slope finite
     """
     action = (mean + log_std.exp() * noise).tanh()
     density = noise.square() * 0.5 + log_std + (1.0 - action.square() + epsilon).log()
-    density = density + mean.detach() * 0.0  # around an infinite mean there is none
+    density = density + mean.detach() * 0.0  # NaN where the mean is infinite
     return action, -density.sum_features() - mean.features * LOG_OF_ROOT_OF_TWO_PI
 
 
 def gaussian(mean: Value, log_std: Value, action: Value) -> tuple[Value, Value]:
-    """Log probability of an action, and the entropy.
+    """Compute the log probability of an action, and the entropy.
 
-    :param log_std: the same for the whole batch
+    :param mean: means, ``[batch, dim]``
+    :param log_std: logarithms of the standard deviations, ``[dim]``, for the whole batch
+    :param action: ``[batch, dim]``
     """
     away = (action - mean) / log_std.exp()
     density = away.square() * 0.5 + log_std + LOG_OF_ROOT_OF_TWO_PI
@@ -38,21 +50,24 @@ def gaussian(mean: Value, log_std: Value, action: Value) -> tuple[Value, Value]:
 
 
 def categorical(logits: Value, action: Value) -> tuple[Value, Value]:
-    """Log probability of an action, and the entropy.
+    """Compute the log probability of an action, and the entropy.
 
-    :param action: its number
+    :param logits: ``[batch, actions]``
+    :param action: numbers of the actions, ``[batch, 1]``
     """
     shifted = logits - logits.max_features()
     log_probs = shifted - shifted.exp().sum_features().log()
-    finite = log_probs.clamp(-LARGEST, math.inf)  # what is impossible adds nothing
+    finite = log_probs.clamp(-LARGEST, math.inf)  # impossible actions add nothing
     entropy = -(log_probs.exp() * finite).sum_features()
     return log_probs.pick(action), entropy
 
 
 def multi_categorical(logits: Value, actions: Value, sizes: Sequence[int]) -> tuple[Value, Value]:
-    """The same of several choices at once.
+    """Compute the log probability and the entropy of several independent choices.
 
-    :param sizes: how many actions each has
+    :param logits: logits of all choices, one after the other
+    :param actions: the number chosen in each, ``[batch, choices]``
+    :param sizes: number of actions in each choice
     """
     found = []
     at = 0
@@ -66,7 +81,11 @@ def multi_categorical(logits: Value, actions: Value, sizes: Sequence[int]) -> tu
 
 
 def bernoulli(logits: Value, actions: Value) -> tuple[Value, Value]:
-    """The same of independent choices between 0 and 1."""
+    """Compute the log probability and the entropy of independent choices between 0 and 1.
+
+    :param logits: ``[batch, choices]``
+    :param actions: 0 or 1, ``[batch, choices]``
+    """
     log_norm = logits.softplus()
     log_prob = (logits * actions - log_norm).sum_features()
     entropy = (log_norm - logits * logits.sigmoid()).sum_features()
@@ -74,7 +93,7 @@ def bernoulli(logits: Value, actions: Value) -> tuple[Value, Value]:
 
 
 def least_of(values: Sequence[Value]) -> Value:
-    """The least of several; where some are equal the gradient is the first one's."""
+    """Compute the minimum of several values; of equal ones the first gets the gradient."""
     least = values[0]
     for value in values[1:]:
         least = least.first_least(value)

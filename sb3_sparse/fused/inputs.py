@@ -1,4 +1,4 @@
-"""Rows that a program is handed: tensors, or rows of arrays read where they are."""
+"""The inputs of a program: tensors, or rows of arrays that are read in place."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ def _name(dtype: th.dtype) -> str:
 
 
 class Inputs:
-    """``input_t`` of ``fused.h`` for each of a program's inputs.
+    """Owns the table of ``input_t`` of ``fused.h``, one entry for each input of a program.
 
-    :param rows: name and number of features of each
+    :param rows: name and number of features of each input
     """
 
     def __init__(self, rows: Sequence[tuple[str, int]]) -> None:
@@ -38,14 +38,14 @@ class Inputs:
 
     @property
     def address(self) -> int:
-        """Of the table."""
+        """Address of the table."""
         return ctypes.addressof(self._table)
 
     def load(self, rows: Mapping[str, th.Tensor]) -> int:
-        """Read these tensors; the size of the batch.
+        """Read inputs from tensors; return the batch size.
 
-        :param rows: by name, shapes ``(batch, features)``, or ``(batch,)`` for one feature
-        :raises NotCovered: for numbers of another shape
+        :param rows: tensors by name, ``(batch, features)``, or ``(batch,)`` for one feature
+        :raises NotCovered: if a shape does not fit
         """
         batch = 0
         for name, tensor in rows.items():
@@ -57,18 +57,18 @@ class Inputs:
             if not tensor.is_contiguous():
                 tensor = tensor.contiguous()
             if batch not in (0, len(tensor)):
-                raise NotCovered("parts of a batch that have not the same size")
+                raise NotCovered("inputs of different batch sizes")
             batch = len(tensor)
             self._put(name, tensor.data_ptr(), kind, tensor.numel() // max(1, batch), 0)
             self._held[name] = tensor
         return batch
 
     def point(self, arrays: Mapping[str, tuple[Array, int]], lead: int) -> None:
-        """Read rows of arrays, by indices.
+        """Read inputs from rows of arrays, in place.
 
-        :param arrays: by name, each with the address of the numbers of its rows, int64
-        :param lead: how many dimensions of an array are not features
-        :raises NotCovered: for numbers of another type or shape
+        :param arrays: arrays by name, each with the address of its row numbers, int64
+        :param lead: number of leading dimensions that are not features
+        :raises NotCovered: if a type or shape does not fit
         """
         for name, (array, index) in arrays.items():
             number = self._numbers.get(name)

@@ -1,4 +1,4 @@
-"""Runs a program on a policy's tensors."""
+"""Runs programs on a policy's tensors."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from sb3_sparse.fused.values import Value
 
 
 class Machine:
-    """A program, and room for its values.
+    """Owns the memory of a program and runs it.
 
-    :param program: what to run
-    :param controller: of the policy whose tensors it moves
-    :param batch: the largest there will be
+    :param program: the program
+    :param controller: controller of the policy whose tensors the program moves
+    :param batch: maximum batch size
     """
 
     def __init__(self, program: Program, controller: Controller, batch: int) -> None:
@@ -89,9 +89,9 @@ class Machine:
         ]
 
     def prepare(self) -> None:
-        """Look where the tensors are now, and what optimizers are set to.
+        """Read the present addresses of the tensors and the settings of the optimizers.
 
-        :raises NotCovered: if one is where the kernels cannot read it
+        :raises NotCovered: if the kernels cannot read a tensor
         """
         self.tables.refresh()
         argument: Any = self._argument
@@ -102,23 +102,24 @@ class Machine:
         argument[7] = self.tables.per_thread
 
     def set(self, scalars: Mapping[str, float]) -> None:
-        """Hand over numbers by name."""
+        """Set the program's scalars; names that it does not use are ignored."""
         for name, number in scalars.items():
             if name in self._lanes:
                 self._lanes[name][:] = number
 
     def load(self, rows: Mapping[str, th.Tensor]) -> None:
-        """Hand over a batch of tensors.
+        """Set the program's inputs from tensors.
 
-        :param rows: as in :meth:`Inputs.load`
-        :raises NotCovered: for numbers of another type or shape
+        :param rows: as for :meth:`Inputs.load`
+        :raises NotCovered: if a type or shape does not fit
         """
         self.set_batch(self.inputs.load(rows))
 
     def index(self, name: str, batch: int) -> tuple[Any, int]:
-        """Room for the numbers of a batch's rows, int64, and its address, which stays.
+        """Give an int64 array for the row numbers of a batch, and its fixed address.
 
-        :param name: of this index
+        :param name: name of the index
+        :param batch: batch size
         """
         if name not in self._indices:
             made = np.zeros(self.capacity, dtype=np.int64)
@@ -128,14 +129,14 @@ class Machine:
         return array[:batch], address
 
     def set_batch(self, batch: int) -> None:
-        """Say how many entries the batch has."""
+        """Set the batch size."""
         if batch != self.batch:
             self.batch = batch
             self._argument[5] = batch
             self.set({"1 / batch": 1 / batch, "batch - 1": batch - 1})
 
     def number(self, name: str) -> float:
-        """What the last run logged under ``name``."""
+        """Give the number that the last run logged under ``name``."""
         return float(self._view[self._logged[name]])
 
     def run(
@@ -146,8 +147,10 @@ class Machine:
         Torch takes the steps of optimizers that the kernels do not know, and those at which masks
         move.
 
-        :param failed: called with the name of a check that fails, before anything behind it is run;
-            if it returns, the run goes on
+        :param first: first operation
+        :param last: end of the range; None: all that follow
+        :param failed: called with the name of a check that fails, before the next operation; if it
+            returns, the run continues
         """
         last = len(self.operations) if last is None else last
         for minimised, step in zip(self.program.minimised, self.steps, strict=True):
@@ -171,7 +174,7 @@ class Machine:
             first = at + 1
 
     def _count(self, first: int, last: int) -> None:
-        """Count the steps that the kernels have taken in a range of operations."""
+        """Count the optimizer steps within a range of operations."""
         for minimised, step in zip(self.program.minimised, self.steps, strict=True):
             if first <= step < last:
                 self.controller.passed(minimised.optimizer)
@@ -186,7 +189,7 @@ class Machine:
         self._repack()
 
     def _repack(self) -> None:
-        """Read anew what layers compute with: weights were written, or lie elsewhere now."""
+        """Read weights again that were written or have moved in memory."""
         for i, operation in enumerate(self.operations):
             if operation.kind in ("PACK", "TURN"):  # in this order, since weights come first
                 self._go(i, i + 1)

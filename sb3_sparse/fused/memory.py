@@ -1,4 +1,4 @@
-"""Where a program's values lie."""
+"""Lays out a program's values in memory."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from sb3_sparse.fused.values import Value
 
 
 class Place(NamedTuple):
-    """Where a value lies, in numbers.
+    """Position of a value in memory, counted in numbers.
 
-    :param at: of its first number
-    :param thread: how far apart threads are; 0: they share it
-    :param tile: how far apart tiles are; 0: one is written over the other
+    :param at: position of its first number
+    :param thread: distance between threads; 0: they share it
+    :param tile: distance between tiles; 0: they overwrite each other
     """
 
     at: int
@@ -27,15 +27,15 @@ class Place(NamedTuple):
 
 
 class Memory:
-    """Room for the values of a program.
+    """Allocates the values of a program.
 
-    A value that is made and read in one phase alone needs room for a tile of each thread, which is
-    used again as soon as nobody reads it any more. So the cache holds what a tile needs.
+    A value that is written and read within one phase needs only one tile for each thread, and its
+    memory is reused after the last read. So the values of a tile fit the cache.
 
     :param operations: in the order in which they run
-    :param values: all there are
-    :param batch: the largest there will be
-    :param threads: how many may share the tiles
+    :param values: all values
+    :param batch: maximum batch size
+    :param threads: number of threads that may share the tiles
     """
 
     def __init__(
@@ -71,21 +71,21 @@ class Memory:
 
 
 class _Room:
-    """Memory that is taken and given back."""
+    """Hands out memory and takes it back."""
 
     def __init__(self) -> None:
         self.size = 0
         self._free: dict[int, list[int]] = defaultdict(list)
 
     def take(self, size: int) -> int:
-        """Where there is room for so many numbers."""
+        """Allocate so many numbers; return their position."""
         if self._free[size]:
             return self._free[size].pop()
         self.size += size
         return self.size - size
 
     def give(self, size: int, at: int) -> None:
-        """Nobody needs it any more."""
+        """Free numbers."""
         self._free[size].append(at)
 
 
@@ -94,7 +94,7 @@ def _values_of(operation: Operation) -> list[Value]:
 
 
 def _uses(operations: Sequence[Operation]) -> dict[Value, tuple[set[int], int, int]]:
-    """The phases that use each value (-1: an operation between phases), its first and last use."""
+    """Find the phases that use each value (-1: between phases), and its first and last use."""
     found: dict[Value, tuple[set[int], int, int]] = {}
     phase = 0
     for number, operation in enumerate(operations):

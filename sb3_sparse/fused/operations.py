@@ -1,4 +1,4 @@
-"""Operations of a program, as ``fused.h`` of the kernels has them."""
+"""The operations of a program, as in ``fused.h`` of the kernels."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ LINEAR_GRAD LINEAR_DENSE_GRAD SUM_BATCH CHECK SPREAD EXPORT PACK TURN MASK_GRADS
 POLYAK
 """
 KINDS = {name: number for number, name in enumerate(NAMES.split())}
-"""Number of each kind."""
+"""The number of each kind."""
 
 
 @dataclass
 class Operation:
-    """One operation, and what the order of all goes by.
+    """One operation, and the dependencies that determine its order.
 
     :param kind: a name of :data:`KINDS`
-    :param to: the result; None if it is none of the program's values
+    :param to: the result; None if it is not a value of the program
     :param operands: up to three values that it reads
-    :param features: of the result
-    :param first: of a range: columns, parameters; or an activation
-    :param last: behind the range
-    :param number: of a layer, parameter, input or activation
-    :param p: parameter of an activation, or a factor
-    :param q: the other parameter
-    :param reads: what else must be there before
-    :param writes: what else is there afterwards
+    :param features: features of the result
+    :param first: start of a range of columns or parameters, or number of an activation
+    :param last: end of the range
+    :param number: number of a layer, parameter, input or activation
+    :param p: first parameter of an activation, or a factor
+    :param q: second parameter of an activation
+    :param reads: other things that must exist before
+    :param writes: other things that exist afterwards
     :param tiled: whether it runs on each tile
-    :param changes: whether it changes parameters, so that all after it must see them changed
+    :param changes: whether it changes parameters, which all later operations must see
     """
 
     kind: str
@@ -52,11 +52,12 @@ class Operation:
 
 
 def in_phases(operations: list[Operation]) -> list[Operation]:
-    """The same operations in an order with few phases, so that a tile stays in the cache.
+    """Order operations into few phases, so that a tile stays in the cache.
 
-    An operation on tiles joins the phase of the latest tiles that it reads; one that reads what was
-    made between phases, a sum over the batch say, begins a later one. What changes parameters comes
-    after everything that was recorded before it, and before everything recorded after.
+    An operation on tiles joins the phase of the latest tiles that it reads. If it reads the result
+    of an operation between phases, such as a sum over the batch, it starts a later phase. An
+    operation that changes parameters comes after all that were recorded before it, and before all
+    that were recorded after it.
     """
     made: dict[Any, tuple[int, bool]] = {}
     epoch = latest = 0

@@ -1,4 +1,4 @@
-"""Optimizers whose steps programs take."""
+"""The optimizers whose steps programs can take."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from sb3_sparse.engine.internals import step_hooks
 from sb3_sparse.engine.native.library import bits_of
 
 FIELDS = 7
-"""Of ``group_t`` of ``fused.h``."""
+"""Fields of ``group_t`` of ``fused.h``."""
 Moments = tuple[th.Tensor | None, th.Tensor, th.Tensor | None]
-"""First and second moment, and the counter if it is a tensor."""
+"""First and second moment, and the step counter if it is a tensor."""
 
 
 class Known(NamedTuple):
     """An optimizer that programs know.
 
-    :param names: settings of a parameter group, in the order in which ``fields`` takes them
-    :param fields: ``group_t`` of ``fused.h``; None for settings that programs do not know
-    :param moments: names of what it remembers, the first and the second; "" where it has none
+    :param names: settings of a parameter group, in the order of the arguments of ``fields``
+    :param fields: gives ``group_t`` of ``fused.h``; None for settings that programs do not know
+    :param moments: names of the first and the second moment; "" if there is none
     """
 
     names: tuple[str, ...]
@@ -59,9 +59,9 @@ _ADAM = Known(
 
 
 def rmsprop(kind: int) -> Callable[..., list[int] | None]:
-    """What RMSprop is set to; its moments decay at ``alpha``.
+    """Make the ``fields`` of RMSprop, whose moments decay at ``alpha``.
 
-    :param kind: 1, or 2 for TensorFlow's way, with epsilon within the root
+    :param kind: 1, or 2 for TensorFlow's variant, with epsilon within the root
     """
 
     def fields(
@@ -97,11 +97,11 @@ KNOWN: dict[type[th.optim.Optimizer], Known] = {
 
 
 class Steps:
-    """The steps of one optimizer: whether the kernels take them, and with what.
+    """Tracks whether the kernels can take an optimizer's steps, and with which settings.
 
-    :param optimizer: whose
-    :param moved: the parameters that have a gradient
-    :param controller: whose hooks on the optimizer do not count
+    :param optimizer: the optimizer
+    :param moved: its parameters that have a gradient
+    :param controller: the controller whose hooks on the optimizer are ignored
     """
 
     def __init__(
@@ -117,10 +117,10 @@ class Steps:
         self.groups: list[list[int]] | None = None
         """``group_t`` of each parameter group; None: torch takes the steps."""
         self.counts = False
-        """Whether the counters are no tensors, so that somebody else must count."""
+        """Whether the step counters are numbers, which the kernels cannot count."""
 
     def refresh(self) -> None:
-        """Look at the settings, and at who watches, now."""
+        """Read the present settings and hooks."""
         if self._known is None or self._getter is None:
             return
         optimizer = self._optimizer
@@ -136,7 +136,7 @@ class Steps:
                 self.groups = groups  # type: ignore[assignment]
 
     def _watched(self) -> bool:
-        """Whether somebody wants to see the steps, besides the controller and this package."""
+        """Whether anybody but the controller and this package has hooks on the steps."""
         pre, post, *everywhere = step_hooks(self._optimizer)
         own = (*pre.values(), *post.values())
         every = chain.from_iterable(hooks.values() for hooks in everywhere)
@@ -145,7 +145,7 @@ class Steps:
         )
 
     def state(self) -> list[Any]:
-        """Another list as soon as the optimizer remembers other tensors."""
+        """Give a list that changes whenever the optimizer has other tensors for its moments."""
         if self.groups is None:
             return [None]
         state = self._optimizer.state
@@ -154,11 +154,11 @@ class Steps:
 
     @property
     def ready(self) -> bool:
-        """Whether the kernels can take the next step: they know it, and there are moments."""
+        """Whether the kernels know the optimizer and its moments exist."""
         return self.groups is not None and all(map(self._optimizer.state.get, self._moved))
 
     def moments(self, tensor: th.Tensor) -> Moments:
-        """What the optimizer remembers of a parameter."""
+        """Give the moments of a parameter."""
         assert self._known is not None
         state = self._optimizer.state[tensor]
         first, second = self._known.moments
@@ -171,7 +171,7 @@ class Steps:
         )
 
     def count(self) -> None:
-        """Count a step that the kernels have taken, where they cannot count themselves."""
+        """Count a step of the kernels where they cannot count it."""
         if self.counts:
             for tensor in self._moved:
                 self._optimizer.state[tensor]["step"] += 1

@@ -1,4 +1,4 @@
-"""Programs: what one gradient step computes, written down once."""
+"""Programs: the operations of one gradient step, recorded once."""
 
 from __future__ import annotations
 
@@ -20,9 +20,17 @@ Parts = Sequence[tuple[nn.Linear, nn.Module | None]]
 
 
 class Program(Recording):
-    """Records operations. Losses are written with :class:`Value`, as they are with tensors.
+    """Records a gradient step; write losses with :class:`Value` as with tensors.
 
-    :param capture: optimizers whose layers' dense gradients are wanted too
+    Example::
+
+        from sb3_sparse.fused import Program
+
+        program = Program()
+        error = program.input("targets", 1) - program.input("predictions", 1)
+        program.log("loss", error.square().mean())
+
+    :param capture: optimizers whose layers also need dense gradients
     """
 
     def __init__(self, capture: Iterable[th.optim.Optimizer] = ()) -> None:
@@ -33,10 +41,10 @@ class Program(Recording):
         self.marks: dict[str, Operation] = {}
         self._places: dict[int, int] = {}
 
-    # What comes from outside
+    # Inputs
 
     def input(self, name: str, features: int) -> Value:
-        """Rows ``[batch, features]`` that each run is handed; ask for a name once."""
+        """Declare an input ``[batch, features]`` of each run, once for each name."""
         assert name not in dict(self.rows)
         value = Value(self, features, True)
         self.record("LOAD_ROWS", value, number=len(self.rows))
@@ -44,7 +52,7 @@ class Program(Recording):
         return value
 
     def parameter(self, tensor: th.Tensor) -> Value:
-        """A vector of parameters outside of layers, as it is now."""
+        """Read a vector of parameters that is not part of a layer."""
         value = Value(self, tensor.numel(), False)
         self.record("SPREAD", value, number=self.slot(tensor, None), tiled=False)
         self.vectors[id(tensor)] = value
@@ -53,7 +61,7 @@ class Program(Recording):
     # Operations
 
     def joined(self, values: Sequence[Value]) -> Value:
-        """Their features one after the other."""
+        """Concatenate the features of some values."""
         made = Value(self, sum(value.features for value in values), True)
         at, parents = 0, []
         for value in values:
@@ -69,7 +77,7 @@ class Program(Recording):
         return made
 
     def network(self, parts: Parts, x: Value) -> Value:
-        """Linear layers and their activations, one after the other.
+        """Apply linear layers and their activations in turn.
 
         :raises NotCovered: for an activation that the kernels do not know
         """
@@ -112,7 +120,7 @@ class Program(Recording):
         return place
 
     def _back_through(self, layer: int, x: Value, g: Value) -> Value:
-        """The gradient of a layer's input, for the features alone whose gradient is wanted."""
+        """Record the gradient of a layer's input, for the features that need it."""
         if layer not in self.turned:
             self.turned.add(layer)
             self.record("TURN", None, number=layer, tiled=False, writes=(("turned", layer),))
@@ -139,37 +147,40 @@ class Program(Recording):
         wanted = [i for i, part in enumerate(parts) if part in self.needs]
         return ends[wanted[0]], ends[wanted[-1] + 1]
 
-    # Learning
+    # Training
 
     def log(self, name: str, value: Value) -> None:
-        """Let each run tell the value of one number."""
+        """Make a number readable after each run."""
         self.logged[name] = value
 
     def mark(self, name: str) -> None:
-        """Name the place behind the last optimizer's step, for runs that end or begin there."""
+        """Name the position after the last optimizer step, where runs may end or begin."""
         self.marks[name] = self.minimised[-1].step
 
     def check(self, value: Value, what: str) -> None:
-        """End a run before anything else changes if there is a NaN in it."""
+        """Stop a run if the value has a NaN.
+
+        :param what: name of the check
+        """
         operation = self.record("CHECK", None, value, features=value.features, tiled=False)
         self.checks[id(operation)] = what
 
     def minimise(
         self, loss: Value, optimizer: th.optim.Optimizer, clip: Value | None = None
     ) -> None:
-        """Take a step of an optimizer down the gradient of a loss.
+        """Differentiate a loss and take a step of an optimizer.
 
-        :param loss: one number
+        :param loss: a single number
         :param optimizer: moves those of its parameters that the loss depends on
-        :param clip: greatest norm of their gradient
+        :param clip: maximum norm of their gradient; None: no clipping
         :raises NotCovered: if the loss uses a layer twice
         """
         Descent(self, optimizer).record(loss, clip)
 
     def polyak_update(self, network: Parts, target_network: Parts, tau: Value) -> None:
-        """Let a target network follow by Polyak averaging.
+        """Update a target network by Polyak averaging.
 
-        :param tau: share of the network
+        :param tau: weight of the online network
         """
         for (online, _), (target, _) in zip(network, target_network, strict=True):
             numbers = [self._layer(online), self._layer(target)]

@@ -1,4 +1,4 @@
-"""What a program consists of, and how a piece is added."""
+"""The contents of a program, and the methods that add to them."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from sb3_sparse.fused.values import Number, Value
 
 @dataclass
 class Slot:
-    """A parameter, as one operation on parameters sees it.
+    """A parameter in the view of one operation.
 
-    :param tensor: torch's
-    :param layer: number of the layer whose weight it is; None: it is no weight
-    :param optimizer: what moves it; None: it is not moved by one
+    :param tensor: torch's tensor
+    :param layer: number of the layer whose weight it is; None: it is not a weight
+    :param optimizer: the optimizer that moves it; None: the operation is not a step
     """
 
     tensor: th.Tensor
@@ -30,12 +30,12 @@ class Slot:
 
 @dataclass
 class Minimised:
-    """A loss that an optimizer makes less.
+    """A loss that an optimizer minimises.
 
-    :param optimizer: which
+    :param optimizer: the optimizer
     :param slots: range of its parameters that have a gradient
-    :param step: the operation in which the optimizer's step is taken
-    :param captured: whether dense gradients are there at that step
+    :param step: the operation that takes the optimizer's step
+    :param captured: whether dense gradients are available at that step
     """
 
     optimizer: th.optim.Optimizer
@@ -45,11 +45,11 @@ class Minimised:
 
 
 class Behind(NamedTuple):
-    """What a value is the result of.
+    """The operation that a value results from.
 
     :param layer: number of the linear layer
-    :param x: its input
-    :param activation: number and parameters of the activation within it
+    :param x: input of the layer
+    :param activation: number and parameters of its activation
     """
 
     layer: int
@@ -58,9 +58,9 @@ class Behind(NamedTuple):
 
 
 class Recording:
-    """Operations, and what they work on.
+    """Collects operations and their values, layers and parameters.
 
-    :param capture: optimizers whose layers' dense gradients are wanted too
+    :param capture: optimizers whose layers also need dense gradients
     """
 
     def __init__(self, capture: Iterable[th.optim.Optimizer] = ()) -> None:
@@ -75,18 +75,18 @@ class Recording:
         self.vectors: dict[int, Value] = {}
         """Vectors of parameters by the id of their tensor."""
         self.behind: dict[Value, Behind] = {}
-        """What makes the results of layers."""
+        """The layer behind each result of one."""
         self.parts: dict[Value, list[Value]] = {}
-        """What values with joined features consist of."""
+        """The parts of each concatenated value."""
         self.turned: set[int] = set()
-        """Layers whose values by columns are up to date."""
+        """Layers whose column-major values are up to date."""
         self.needs: set[Value] = set()
-        """Values whose gradient the loss at hand asks for."""
+        """Values whose gradient the present loss needs."""
 
     def record(
         self, kind: str, to: Value | None, *operands: Value, features: int = 0, **others: Any
     ) -> Operation:
-        """Append an operation; it runs on tiles if its result is batched."""
+        """Append an operation, which runs on tiles if its result is batched."""
         if to is not None:
             features = to.features
             others.setdefault("tiled", to.batched)
@@ -95,23 +95,23 @@ class Recording:
         return operation
 
     def scalar(self, name: str) -> Value:
-        """A number that each run is handed."""
+        """Declare a number that each run sets."""
         if name not in self.scalars:
             self.scalars[name] = Value(self, 1, False)
         return self.scalars[name]
 
     def constant(self, number: float) -> Value:
-        """A number that stays."""
+        """Give a constant as a value."""
         if number not in self.constants:
             self.constants[number] = Value(self, 1, False)
         return self.constants[number]
 
     def value(self, number: Number) -> Value:
-        """The value, or that of a number."""
+        """Convert a number to a value."""
         return number if isinstance(number, Value) else self.constant(float(number))
 
     def activated(self, x: Value, activation: nn.Module) -> Value:
-        """An activation of ``x``; whoever asks for it knows its gradient."""
+        """Apply an activation to ``x``; the caller defines its gradient."""
         made = Value(self, x.features, x.batched)
         kind, p, q = number_of(activation)
         self.record("ACTIVATION", made, x, number=kind, p=p, q=q)
@@ -120,6 +120,6 @@ class Recording:
     def slot(
         self, tensor: th.Tensor, layer: int | None, optimizer: th.optim.Optimizer | None = None
     ) -> int:
-        """A row of the table of parameters; its number."""
+        """Add a row to the table of parameters; return its number."""
         self.slots.append(Slot(tensor, layer, optimizer))
         return len(self.slots) - 1

@@ -1,4 +1,4 @@
-"""How a program reads a layer's weight: by its connections, or as a matrix."""
+"""Chooses how a program reads each weight: by its connections or as a matrix."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from sb3_sparse.fused.errors import NotCovered
 
 
 class Stored(NamedTuple):
-    """A weight as it is now.
+    """The present form of a weight.
 
-    :param numbers: what the kernels read and optimizers move
-    :param structure: connections; None: the weight is read as a matrix, as it is without zeros
-    :param flat: where each connection stands in ``numbers``, int32; None: one after the other
-    :param mask: of a matrix, 0 where inactive; None: all count
-    :param layer: the sparse layer whose weight it is; None: it is a target's, or not sparse
+    :param numbers: the tensor that the kernels read and optimizers move
+    :param structure: connections; None: the weight is read as a matrix
+    :param flat: position of each connection in ``numbers``, int32; None: consecutive
+    :param mask: mask of a matrix, 0 where inactive; None: all weights count
+    :param layer: storage of the weight; None for targets and dense layers
     """
 
     numbers: th.Tensor
@@ -37,15 +37,15 @@ class Stored(NamedTuple):
 
     @property
     def size(self) -> int:
-        """How many numbers an optimizer moves."""
+        """Count of the numbers that an optimizer moves."""
         return self.numbers.numel() if self.structure is None else self.structure.nnz
 
 
 class Storage:
-    """The weights of a policy's linear layers.
+    """Tracks the weights of a policy's linear layers.
 
-    :param controller: knows the sparse ones
-    :param modules: those whose weights are asked for
+    :param controller: controller of the policy
+    :param modules: the linear layers of the program
     """
 
     def __init__(self, controller: Controller, modules: Iterable[nn.Linear]) -> None:
@@ -63,13 +63,13 @@ class Storage:
         ]  # fmt: skip
         self._structures: dict[int, tuple[object, Structure, th.Tensor]] = {}
         self._own: dict[int, tuple[nn.Linear, np.ndarray]] = {}
-        """Targets read by connections of their own, and which of their numbers were not 0."""
+        """Targets with connections of their own, and the mask of their weights that are not 0."""
         self._rewritten = 0
 
     def state(self) -> list[object]:
-        """Another list as soon as :meth:`of` gives something else, but for where tensors lie."""
+        """Give a list that changes whenever :meth:`of` would, apart from addresses."""
         for key, (module, written) in list(self._own.items()):
-            if not np.array_equal(_written(module), written):  # by a copy that torch did not count
+            if not np.array_equal(_written(module), written):  # by a copy that torch does not count
                 del self._own[key]
                 self._rewritten += 1
         return [
@@ -81,10 +81,10 @@ class Storage:
         ]
 
     def of(self, module: nn.Linear, follows: bool) -> Stored:
-        """How the weight of a layer is stored now.
+        """Describe the present form of a layer's weight.
 
         :param follows: whether it is a target that follows its layer at each step
-        :raises NotCovered: if it is nothing that the kernels read
+        :raises NotCovered: if the kernels cannot read it
         """
         if isinstance(module, SparseLinear):
             structure, values = module.live()
@@ -135,9 +135,9 @@ def _written(module: nn.Linear) -> np.ndarray:
 
 
 def check_readable(tensor: th.Tensor) -> None:
-    """Refuse what the kernels cannot read in place.
+    """Reject a tensor that the kernels cannot read in place.
 
-    :raises NotCovered: for anything but contiguous float32 on the CPU
+    :raises NotCovered: unless it is contiguous float32 on the CPU
     """
     if not readable(tensor):
         raise NotCovered(f"a parameter of {tensor.dtype} on {tensor.device}")

@@ -1,4 +1,4 @@
-"""Where a program's layers, parameters and optimizers are in memory."""
+"""Tables of the addresses of a program's layers, parameters and optimizers."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ def _padded(count: int) -> int:
 
 
 class Tables:
-    """``linear_t``, ``parameter_t`` and ``group_t`` of ``fused.h``, kept up to date.
+    """Keeps the tables of ``linear_t``, ``parameter_t`` and ``group_t`` of ``fused.h`` up to date.
 
-    :param program: whose
-    :param controller: of the policy
+    :param program: the program
+    :param controller: controller of the policy
     """
 
     def __init__(self, program: Program, controller: Controller) -> None:
@@ -67,21 +67,21 @@ class Tables:
 
     @property
     def addresses(self) -> list[int]:
-        """Of the three tables."""
+        """Addresses of the three tables."""
         return [ctypes.addressof(array) for array in self._arrays]
 
     def ready(self, minimised: Minimised) -> bool:
-        """Whether the kernels take the optimizer's next step."""
+        """Whether the kernels can take the optimizer's next step."""
         return self._ready[id(minimised.optimizer)]
 
     def count(self, minimised: Minimised) -> None:
-        """Note that the kernels take a step."""
+        """Count a step that the kernels take."""
         self._steps[id(minimised.optimizer)].count()
 
     def refresh(self) -> None:
-        """Look where everything is now.
+        """Read the present addresses and settings.
 
-        :raises NotCovered: if something is where the kernels cannot read it
+        :raises NotCovered: if the kernels cannot read something
         """
         steps = self._steps.values()
         for one in steps:
@@ -136,7 +136,7 @@ class Tables:
         self._arrays[1] = (ctypes.c_int64 * max(1, len(fields)))(*fields)
 
     def _place_grads(self) -> None:
-        """Room for the gradient of each parameter, once for each thread."""
+        """Allocate the gradient of each parameter, once for each thread."""
         self._places = {}
         at = 0
         for slot in self._program.slots:
@@ -155,7 +155,7 @@ class Tables:
         return 0 if place is None else self._grads.data_ptr() + 4 * place[0]
 
     def _address(self, tensor: th.Tensor | None) -> int:
-        """Where it lies; held, so that nobody frees it."""
+        """Give the address of a tensor, and hold the tensor so that it stays allocated."""
         if tensor is None:
             return 0
         self._held.append(tensor)
@@ -222,7 +222,7 @@ class Tables:
         ]
 
     def hand_over(self, minimised: Minimised) -> None:
-        """Give torch's parameters the gradients that the kernels have computed."""
+        """Copy the gradients that the kernels have computed to torch's parameters."""
         for group in minimised.optimizer.param_groups:
             for parameter in group["params"]:
                 parameter.grad = None

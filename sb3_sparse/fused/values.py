@@ -1,4 +1,4 @@
-"""Values of a program: what losses are written with."""
+"""Values of a program, in terms of which losses are written."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from torch import nn
 
 Number = Union["Value", float]
 Back = Callable[["Value"], "Value"]
-"""The share of a parent in the gradient of a value."""
+"""Gives the gradient of a parent from the gradient of a value."""
 
 
 class Recorder(Protocol):
-    """Notes what is done with values."""
+    """The view of a program that its values have."""
 
     values: list[Value]
 
@@ -21,28 +21,36 @@ class Recorder(Protocol):
         """Append an operation."""
 
     def scalar(self, name: str) -> Value:
-        """A number that each run is handed."""
+        """Declare a number that each run sets."""
 
     def constant(self, number: float) -> Value:
-        """A number that stays."""
+        """Give a constant as a value."""
 
     def value(self, number: Number) -> Value:
-        """The value, or that of a number."""
+        """Convert a number to a value."""
 
     def activated(self, x: Value, activation: nn.Module) -> Value:
-        """An activation of ``x``."""
+        """Apply an activation to ``x``."""
 
 
 class Value:
     """Numbers ``[batch, features]`` of a program, or ``[features]`` that the whole batch shares.
 
-    Arithmetic records operations and gives new values. Features are broadcast: one goes with any
-    number of them.
+    Arithmetic records operations and gives new values. A single feature is broadcast to any number
+    of features.
 
-    :param program: which records
-    :param features: how many
-    :param batched: whether each entry of the batch has its own
-    :param parents: what it was made of, each with its share in the gradient
+    Example::
+
+        from sb3_sparse.fused import Program
+
+        q = Program().input("q", 4)
+        loss = (q.max_features() - 1.0).huber().mean()
+        loss.features, loss.batched  # (1, False)
+
+    :param program: the program that records
+    :param features: number of features
+    :param batched: whether each entry of the batch has its own numbers
+    :param parents: the values that it was computed from, each with its gradient
     """
 
     def __init__(
@@ -59,19 +67,19 @@ class Value:
         self.root = self
         self.offset = 0
         self.origin = 0
-        """Of a gradient that is there for some features alone: the first of them."""
+        """First feature of a gradient that covers only some features."""
         self.gated = False
-        """Whether a gradient is 0 already where the ReLU in front of it is."""
+        """Whether a gradient is already 0 where the ReLU before it is."""
         program.values.append(self)
 
     def view(self, first: int, last: int) -> Value:
-        """Features ``first`` to ``last`` of it, in place."""
+        """View features ``first`` to ``last``, without a copy or a gradient."""
         found = Value(self.program, last - first, self.batched)
         found.root, found.offset = self.root, self.offset + first
         return found
 
     def detach(self) -> Value:
-        """The same numbers, through which no gradient flows."""
+        """Give the same numbers without a gradient."""
         return self.view(0, self.features)
 
     def __getitem__(self, part: slice) -> Value:
@@ -128,15 +136,15 @@ class Value:
     # Comparisons: 1.0 where they hold, else 0.0
 
     def less(self, other: Number) -> Value:
-        """Whether it is less."""
+        """Compare: 1.0 where less than ``other``."""
         return self._made("LESS", other)
 
     def same(self, other: Number) -> Value:
-        """Whether it is equal."""
+        """Compare: 1.0 where equal to ``other``."""
         return self._made("SAME", other)
 
     def first_least(self, other: Value) -> Value:
-        """The lesser of two; where they are equal the gradient is the first one's."""
+        """Compute the minimum; of equal values the first gets the gradient."""
         return self._made(
             "LEAST",
             other,
@@ -144,7 +152,7 @@ class Value:
         )
 
     def least(self, other: Value) -> Value:
-        """The lesser of two; where they are equal each gets half of the gradient."""
+        """Compute the minimum; equal values get half of the gradient each."""
 
         def back(one: Value, two: Value) -> Back:
             return lambda g: g * (one.less(two) + one.same(two) * 0.5)
@@ -152,7 +160,7 @@ class Value:
         return self._made("LEAST", other, back=(back(self, other), back(other, self)))
 
     def clamp(self, least: Number, most: Number) -> Value:
-        """Brought between bounds; the gradient is 0 beyond them."""
+        """Clamp to bounds; the gradient is 0 beyond them."""
         return self._made(
             "CLAMP", least, most, back=(lambda g: g * self._made("INSIDE", least, most),)
         )
@@ -160,47 +168,47 @@ class Value:
     # Functions
 
     def exp(self) -> Value:
-        """``e^x``."""
+        """Compute ``e^x``."""
         made = self._made("EXP")
         made.parents = ((self, lambda g: g * made),)
         return made
 
     def log(self) -> Value:
-        """The natural logarithm."""
+        """Compute the natural logarithm."""
         return self._made("LOG", back=(lambda g: g / self,))
 
     def sqrt(self) -> Value:
-        """The square root."""
+        """Compute the square root."""
         made = self._made("SQRT")
         made.parents = ((self, lambda g: g * 0.5 / made),)
         return made
 
     def abs(self) -> Value:
-        """The magnitude; it has no gradient here."""
+        """Compute the magnitude, without a gradient."""
         return self._made("ABS")
 
     def square(self) -> Value:
-        """The square."""
+        """Compute the square."""
         return self._made("MULTIPLY", self, back=(lambda g: g * (self * 2.0),))
 
     def huber(self) -> Value:
-        """Smooth L1: half the square up to 1, then linear."""
+        """Compute the smooth L1 loss: half the square up to 1, then linear."""
         return self._made("HUBER", back=(lambda g: g * self.clamp(-1.0, 1.0),))
 
     def tanh(self) -> Value:
-        """The hyperbolic tangent."""
+        """Compute the hyperbolic tangent."""
         made = self.program.activated(self, nn.Tanh())
         made.parents = ((self, lambda g: g * (1.0 - made.square())),)
         return made
 
     def sigmoid(self) -> Value:
-        """``1 / (1 + e^-x)``."""
+        """Compute ``1 / (1 + e^-x)``."""
         made = self.program.activated(self, nn.Sigmoid())
         made.parents = ((self, lambda g: g * (made * (1.0 - made))),)
         return made
 
     def softplus(self) -> Value:
-        """``log(1 + e^x)``."""
+        """Compute ``log(1 + e^x)``."""
         made = self.program.activated(self, nn.Softplus())
         made.parents = ((self, lambda g: g * self.sigmoid()),)
         return made
@@ -208,19 +216,19 @@ class Value:
     # Sums
 
     def sum_features(self) -> Value:
-        """The sum over features."""
+        """Sum over features."""
         made = Value(self.program, 1, self.batched, ((self, lambda g: g),))
         self.program.record("SUM_FEATURES", made, self, first=self.features)
         return made
 
     def max_features(self) -> Value:
-        """The greatest feature; it has no gradient here."""
+        """Compute the maximum over features, without a gradient."""
         made = Value(self.program, 1, self.batched)
         self.program.record("MAX_FEATURES", made, self, first=self.features)
         return made
 
     def pick(self, index: Value) -> Value:
-        """The feature whose number is ``index``."""
+        """Select the feature with number ``index``."""
         made = Value(self.program, 1, self.batched)
 
         def back(g: Value) -> Value:
@@ -233,7 +241,7 @@ class Value:
         return made
 
     def sum(self) -> Value:
-        """The sum over the batch, by features."""
+        """Sum over the batch, for each feature."""
         made = Value(self.program, self.features, False)
 
         def back(g: Value) -> Value:
@@ -246,7 +254,7 @@ class Value:
         return made
 
     def mean(self) -> Value:
-        """The mean over batch and features."""
+        """Average over batch and features."""
         total = self.sum()
         if self.features > 1:
             total = total.sum_features()

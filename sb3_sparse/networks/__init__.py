@@ -1,4 +1,4 @@
-"""Network architectures. They know nothing of masks."""
+"""Network architectures, independent of masks."""
 
 from sb3_sparse.networks.impala import ImpalaCNN
 from sb3_sparse.networks.nature import ScaledNatureCNN

@@ -1,4 +1,4 @@
-"""What the image networks share."""
+"""Helpers of the image networks."""
 
 from __future__ import annotations
 
@@ -17,12 +17,14 @@ from sb3_sparse.sparsity.numeric import is_whole
 def check_images(
     name: str, observation_space: spaces.Space[Any], channels: Sequence[int], normalized_image: bool
 ) -> spaces.Box:
-    """The observation space, if it holds channel-first images.
+    """Validate that an observation space holds channel-first images, and return it.
 
-    :param name: class that asks, for the message
+    :param name: class name for the error message
+    :param observation_space: the space
     :param channels: three channel counts, each 1 or more
     :param normalized_image: whether images lie in [0, 1] rather than in 0..255
-    :raises ConfigError: if it does not, or if the channels are not three positive whole numbers
+    :raises ConfigError: if the space holds no images, or if ``channels`` are not three positive
+        whole numbers
     """
     if not isinstance(observation_space, spaces.Box) or not is_image_space(
         observation_space, check_channels=False, normalized_image=normalized_image
@@ -38,6 +40,6 @@ def check_images(
 
 
 def flat_size(network: nn.Module, space: spaces.Box) -> int:
-    """Length of the flat output for one observation."""
+    """Compute the length of the flat output for one observation."""
     with th.no_grad():
         return int(network(th.zeros(1, *space.shape)).shape[1])

@@ -13,7 +13,7 @@ from sb3_sparse.networks.images import check_images, flat_size
 
 
 class ResidualBlock(nn.Module):
-    """``x + conv(relu(conv(relu(x))))`` with 3×3 convolutions that keep the size."""
+    """Computes ``x + conv(relu(conv(relu(x))))`` with 3×3 convolutions that keep the size."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -30,7 +30,7 @@ class ResidualBlock(nn.Module):
 
 
 def stack(inputs: int, outputs: int) -> list[nn.Module]:
-    """A convolution, a max pool that halves the size (rounded up), and two residual blocks."""
+    """Build a convolution, a max pool that halves the size (rounded up), and two blocks."""
     return [
         nn.Conv2d(inputs, outputs, kernel_size=3, padding=1),
         nn.MaxPool2d(kernel_size=3, stride=2, padding=1),
@@ -40,16 +40,25 @@ def stack(inputs: int, outputs: int) -> list[nn.Module]:
 
 
 class ImpalaCNN(BaseFeaturesExtractor):
-    """The paper's ResNet: three stacks and one dense layer, no batch norm.
+    """The Impala ResNet: three stacks and one dense layer, without batch normalisation.
 
-    ``policy_kwargs=dict(features_extractor_class=ImpalaCNN, net_arch=[])`` puts it under the heads
-    of DQN or PPO; without ``net_arch=[]`` SB3 puts hidden layers between.
+    ``net_arch=[]`` puts it directly under the heads; otherwise SB3 adds hidden layers.
+
+    Example::
+
+        import numpy as np
+        from gymnasium import spaces
+        from sb3_sparse.networks import ImpalaCNN
+
+        images = spaces.Box(0, 255, (4, 84, 84), np.uint8)
+        ImpalaCNN(images).features_dim  # 512
+        policy_kwargs = dict(features_extractor_class=ImpalaCNN, net_arch=[], sparsity=0.9)
 
     :param observation_space: images, channels first, of shape (channels, height, width)
     :param channels: channels of the three stacks
     :param features_dim: units of the dense layer
-    :param normalized_image: whether images lie in [0, 1] already, as SB3's ``NatureCNN`` takes it
-    :raises ConfigError: for observations that are no images
+    :param normalized_image: whether images lie in [0, 1] already, as for SB3's ``NatureCNN``
+    :raises ConfigError: if the observations are not images
 
     Source: arXiv:2206.10369, table of the DQN architectures; Espeholt et al. 2018
     (arXiv:1802.01561), figure 3, with twice its channels.

@@ -1,4 +1,4 @@
-"""The Nature CNN in other widths."""
+"""The Nature CNN with other widths."""
 
 from __future__ import annotations
 
@@ -15,11 +15,20 @@ from sb3_sparse.networks.images import check_images, flat_size
 class ScaledNatureCNN(NatureCNN):
     """SB3's NatureCNN with a choice of channels, for dense baselines of equal parameter count.
 
+    Example::
+
+        import numpy as np
+        from gymnasium import spaces
+        from sb3_sparse.networks import ScaledNatureCNN
+
+        images = spaces.Box(0, 255, (4, 84, 84), np.uint8)
+        ScaledNatureCNN(images, channels=(10, 20, 20), features_dim=160)
+
     :param observation_space: images, channels first, of shape (channels, height, width)
     :param channels: channels of the three convolutions
     :param features_dim: units of the dense layer
-    :param normalized_image: as SB3's ``NatureCNN`` takes it
-    :raises ConfigError: for observations that are no images
+    :param normalized_image: whether images lie in [0, 1] already, as for SB3's ``NatureCNN``
+    :raises ConfigError: if the observations are not images
 
     Source: Mnih et al. 2015, *Human-level control through deep reinforcement learning*; arXiv:
     2206.10369, table of the DQN architectures.

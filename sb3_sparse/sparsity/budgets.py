@@ -1,4 +1,4 @@
-"""How a sparsity is shared between actor and critics."""
+"""Share one sparsity budget between the actor and the critics."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ def feasible_actor_share(
 
 
 def _rounded_up(low: float) -> float:
-    """The next number of four decimals that is feasible, 0 itself excluded."""
+    """The smallest feasible number with four decimals, above 0."""
     return max(1, math.ceil(low * 1e4 - 1e-9)) / 1e4
 
 
 def _rounded_down(high: float) -> float:
-    """The last number of four decimals that is feasible, 1 itself excluded."""
+    """The largest feasible number with four decimals, below 1."""
     return min(9999, math.floor(high * 1e4 + 1e-9)) / 1e4
 
 
@@ -38,6 +38,12 @@ def split_sparsity(
     """Sparsity of the actor and of each critic for one common budget.
 
     Both are equally sparse at ``actor_share = actor_size / (actor_size + critics_size)``.
+
+    Example::
+
+        from sb3_sparse.sparsity import split_sparsity
+
+        split_sparsity(72960, 143360, sparsity=0.9, actor_share=0.5)  # (0.8517, 0.9246)
 
     :param actor_size: connections of the dense actor
     :param critics_size: connections of all dense critics together (two critics count twice)

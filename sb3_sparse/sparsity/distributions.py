@@ -1,4 +1,4 @@
-"""How a network's sparsity is shared out among its layers.
+"""Share a network's sparsity among its layers.
 
 Sources: uniform and ERK as in arXiv:1911.11134 (RigL), section 3; ER as in arXiv:1707.04780 (SET).
 """
@@ -15,15 +15,15 @@ Shape = Sequence[int]
 
 
 def floor_count(value: float) -> int:
-    """Floor that forgives floating error: ``0.29 * 100`` is 29, not 28.
+    """Floor that tolerates rounding: ``0.29 * 100`` gives 29, not 28.
 
-    :param value: a count that ought to be exact but was computed in floating point
+    :param value: a count computed in floating point
     """
     return math.floor(value + 1e-6)
 
 
 def check_sparsity(sparsity: float, what: str = "sparsity") -> float:
-    """Return ``sparsity`` as a float.
+    """Validate a sparsity and return it as a float.
 
     :raises ConfigError: unless it is a number in [0, 1)
     """
@@ -45,8 +45,8 @@ def _erdos_renyi(
 ) -> list[float]:
     """Densities proportional to ``sum(dims) / prod(dims)``, capped at 1.
 
-    A layer whose share would exceed its size becomes dense and the others pay for it, until no
-    layer exceeds it; layers that tie for the largest score become dense together.
+    A layer whose share would exceed its size becomes dense, and the other layers share the rest,
+    until no layer exceeds its size. Layers that tie for the largest score become dense together.
     """
     sizes = [math.prod(shape) for shape in shapes]
     zeros = [floor_count(sparsity * size) for size in sizes]
@@ -79,9 +79,9 @@ DISTRIBUTIONS: dict[str, Callable[[Sequence[Shape], float], list[float]]] = {
 
 
 def check_distribution(distribution: str) -> str:
-    """Return ``distribution``.
+    """Validate the name of a distribution and return it.
 
-    :raises ConfigError: if there is none of that name
+    :raises ConfigError: if no distribution has that name
     """
     if not isinstance(distribution, str) or distribution not in DISTRIBUTIONS:
         raise ConfigError(
@@ -92,19 +92,26 @@ def check_distribution(distribution: str) -> str:
 
 
 def active_counts(shapes: Sequence[Shape], sparsity: float, distribution: str = "erk") -> list[int]:
-    """Number of active connections of each layer of one network.
+    """Compute the number of active connections in each layer of one network.
 
-    The number of zeros in a layer is exactly ``floor(s_l * N_l)``, and a layer keeps at least one
-    connection.
+    A layer of ``N_l`` connections and sparsity ``s_l`` has exactly ``floor(s_l * N_l)`` zeros, but
+    always keeps at least one connection.
+
+    Example::
+
+        from sb3_sparse.sparsity import active_counts
+
+        active_counts([(256, 17), (256, 256), (6, 256)], sparsity=0.9)  # [1951, 3658, 1536]
+        active_counts([(256, 17), (256, 256)], sparsity=0.9, distribution="uniform")  # [436, 6554]
 
     :param shapes: weight shapes in torch order: ``(out, in)`` or ``(out, in, *kernel)``
     :param sparsity: removed fraction of the network's connections, in [0, 1)
-    :param distribution: ``"uniform"`` (every layer the same), ``"erk"`` (Erdős–Rényi kernel) or
-        ``"er"`` (the same without the kernel's window)
+    :param distribution: ``"uniform"`` (the same sparsity in every layer), ``"erk"`` (Erdős–Rényi
+        kernel) or ``"er"`` (the same without convolution windows)
     :return: nnz per layer, in the order of ``shapes``
-    :raises ConfigError: for a sparsity, distribution or shape that is not allowed
+    :raises ConfigError: for an invalid sparsity, distribution or shape
 
-    Source: arXiv:1911.11134, section 3; the kernel's window counts as in arXiv:2206.10369.
+    Source: arXiv:1911.11134, section 3; convolution windows count as in arXiv:2206.10369.
     """
     sparsity = check_sparsity(sparsity)
     check_distribution(distribution)

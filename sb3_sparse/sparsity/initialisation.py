@@ -1,4 +1,4 @@
-"""Masks and weights at the start."""
+"""Initial masks and weights."""
 
 from __future__ import annotations
 
@@ -13,12 +13,18 @@ from sb3_sparse.sparsity.selection import largest
 
 
 def random_mask(shape: Sequence[int], active: int, seed: int, name: str) -> NDArray[np.bool_]:
-    """A mask with exactly ``active`` connections, uniformly at random.
+    """Draw a mask with exactly ``active`` connections, uniformly at random.
+
+    Example::
+
+        from sb3_sparse.sparsity import random_mask
+
+        random_mask((256, 17), active=435, seed=0, name="actor.latent_pi.0").sum()  # 435
 
     :param shape: the weight's shape
     :param active: nnz
     :param seed: mask seed
-    :param name: the layer's name, so that layers and critics are independent of each other
+    :param name: the layer's name, which makes layers and critics independent
     """
     size = math.prod(shape)
     mask = np.zeros(size, dtype=np.bool_)
@@ -27,17 +33,17 @@ def random_mask(shape: Sequence[int], active: int, seed: int, name: str) -> NDAr
 
 
 def glorot_limits(mask: NDArray[np.bool_], gain: float = 1.0) -> NDArray[np.float64]:
-    """Bound of the uniform distribution of each connection, by the fans that are really there.
+    """Compute the bound of each connection's uniform distribution from its active fans.
 
     ``L = gain * sqrt(3 / max(1, (fan_in + fan_out) / 2))`` with the active fan-in of the output
-    unit and the active fan-out of the input unit, for convolutions summed over the window.
+    unit and the active fan-out of the input unit; convolutions sum over the window.
 
     :param mask: shape ``(out, in, *kernel)``
     :param gain: factor relative to Glorot's bound
-    :return: shape ``(out, in, 1, ...)``, to be broadcast over the window
+    :return: shape ``(out, in, 1, ...)``, which broadcasts over the window
 
-    Source: arXiv:2010.03533 scales by fan-in; the paper's text (arXiv:2206.10369) does too, its
-    public code uses both fans. We follow the code.
+    Source: arXiv:2010.03533 scales by fan-in, as does the text of arXiv:2206.10369; the public code
+    of the latter uses both fans, and so does this function.
     """
     window = tuple(range(2, mask.ndim))
     fan_in = mask.sum(axis=(1, *window), keepdims=True)
@@ -49,12 +55,12 @@ def glorot_limits(mask: NDArray[np.bool_], gain: float = 1.0) -> NDArray[np.floa
 def sparsity_aware_weights(
     mask: NDArray[np.bool_], seed: int, name: str, gain: float = 1.0
 ) -> NDArray[np.float32]:
-    """Weights drawn afresh, Glorot uniform on the sparse graph, 0 where inactive.
+    """Draw Glorot uniform weights for a sparse layer, 0 where inactive.
 
     :param mask: shape ``(out, in, *kernel)``
     :param seed: mask seed
     :param name: the layer's name
-    :param gain: the gain with which SB3 initialises the layer, 1 where it has none
+    :param gain: SB3's gain for the layer; 1 if it has none
     """
     draws = random_uniform(seed, f"{name}/weight", mask.size).reshape(mask.shape)
     return np.where(mask, draws * glorot_limits(mask, gain), 0.0).astype(np.float32)

@@ -1,4 +1,4 @@
-"""What changes over the course of training. Progress is environment steps done / planned."""
+"""Schedules over the progress of training, i.e. environment steps done / planned."""
 
 from __future__ import annotations
 
@@ -8,11 +8,17 @@ from sb3_sparse.sparsity.distributions import floor_count
 
 
 def cosine_drop_fraction(progress: float, drop_fraction: float, end: float) -> float:
-    """Share of a layer's connections that one update exchanges.
+    """Compute the share of a layer's connections that one update exchanges.
+
+    Example::
+
+        from sb3_sparse.sparsity import cosine_drop_fraction
+
+        cosine_drop_fraction(progress=0.5, drop_fraction=0.4, end=1.0)  # 0.2
 
     :param progress: environment steps done / planned, in [0, 1]
-    :param drop_fraction: its value at the start
-    :param end: progress at which it reaches 0
+    :param drop_fraction: the share at the start
+    :param end: progress at which the share reaches 0
 
     Source: arXiv:1907.04840 and arXiv:1911.11134, section 3.
     """
@@ -24,7 +30,7 @@ def cosine_drop_fraction(progress: float, drop_fraction: float, end: float) -> f
 def pruned_count(
     size: int, initial: int, final: int, progress: float, begin: float, end: float
 ) -> int:
-    """Connections that gradual pruning leaves in a layer.
+    """Compute the number of connections that gradual pruning leaves in a layer.
 
     The layer's sparsity rises from its initial to its final value along a cubic ramp.
 

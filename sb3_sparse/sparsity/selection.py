@@ -1,4 +1,4 @@
-"""Exact selection by score. Ties break towards the lowest index, never by luck."""
+"""Exact selection by score. Ties break towards the lowest index, so the choice is reproducible."""
 
 from __future__ import annotations
 
@@ -11,9 +11,14 @@ Indices = NDArray[np.int64]
 
 
 def largest(scores: NDArray[Any], count: int) -> Indices:
-    """Positions of the ``count`` largest scores, ascending.
+    """Find the positions of the ``count`` largest scores, ascending. NaN counts as the smallest.
 
-    A score that is not a number counts as the smallest.
+    Example::
+
+        import numpy as np
+        from sb3_sparse.sparsity import largest
+
+        largest(np.array([0.1, 0.5, 0.3]), 2)  # array([1, 2])
 
     :param scores: shape ``(n,)``, any ordered dtype
     :param count: between 0 and n
@@ -32,7 +37,7 @@ def largest(scores: NDArray[Any], count: int) -> Indices:
 
 
 def least_magnitude(weights: NDArray[np.float32], active: Indices, count: int) -> Indices:
-    """The ``count`` active connections of least ``|weight|``, as ascending flat indices.
+    """Find the ``count`` active connections of least ``|weight|``, as ascending flat indices.
 
     :param weights: the layer's weights, shape ``(n,)``
     :param active: flat indices of its active connections, ascending

@@ -1,4 +1,4 @@
-"""The dense network that has as many parameters as a sparse one."""
+"""Find the dense network that has as many parameters as a sparse one."""
 
 from __future__ import annotations
 
@@ -9,29 +9,36 @@ from sb3_sparse.errors import ConfigError
 
 
 def mlp_parameters(inputs: int, hidden: Sequence[int], outputs: int) -> int:
-    """Weights and biases of a dense multi-layer perceptron."""
+    """Count the weights and biases of a dense multi-layer perceptron."""
     return sum(a * b + b for a, b in pairwise([inputs, *hidden, outputs]))
 
 
 def scaled_widths(hidden: Sequence[int], factor: float) -> list[int]:
-    """Every width times ``factor``, rounded, at least 1."""
+    """Multiply every width by ``factor`` and round, to at least 1."""
     return [max(1, round(width * factor)) for width in hidden]
 
 
 def equivalent_widths(
     hidden: Sequence[int], parameters: Callable[[list[int]], int], target: int
 ) -> tuple[list[int], int]:
-    """Hidden widths of the parameter-equivalent dense network.
+    """Compute the hidden widths of the parameter-equivalent dense network.
 
-    One factor scales all widths; it is searched so that the whole parameter count comes nearest to
-    the sparse network's (a tie goes to the smaller network).
+    One factor scales all widths, such that the parameter count comes nearest to that of the sparse
+    network; of two equally near networks the smaller is taken.
+
+    Example::
+
+        from sb3_sparse.sparsity import equivalent_widths, mlp_parameters
+
+        equivalent_widths([256, 256], lambda hidden: mlp_parameters(17, hidden, 6), 7500)
+        # ([75, 75], 7506)
 
     :param hidden: hidden widths of the full dense network
-    :param parameters: whole parameter count (biases included) as a function of the widths;
-        must not fall when a width grows
+    :param parameters: gives the parameter count, biases included, for such widths; must not
+        fall when a width grows
     :param target: parameter count of the sparse network (nnz and biases)
     :return: ``(widths, their parameter count)``
-    :raises ConfigError: if even the full network has fewer parameters than ``target``
+    :raises ConfigError: if the full network has fewer parameters than ``target``
 
     Source: arXiv:2206.10369, section on the experimental setup.
     """

@@ -1,4 +1,4 @@
-"""What a topology method is: a pure function from a layer to the connections it exchanges."""
+"""Base classes of topology methods: pure functions from a layer to the connections it exchanges."""
 
 from __future__ import annotations
 
@@ -17,7 +17,16 @@ Array = NDArray[Any]
 
 
 class Layer(Protocol):
-    """What a method may know of a layer. All arrays are flat, of length ``size``."""
+    """The view of a layer that a method gets. All arrays are flat, of length ``size``.
+
+    Example::
+
+        import numpy as np
+        from sb3_sparse.topology import Layer
+
+        def weakest(layer: Layer) -> int:
+            return int(np.where(layer.mask(), np.abs(layer.dense()), np.inf).argmin())
+    """
 
     @property
     def name(self) -> str:
@@ -37,14 +46,14 @@ class Layer(Protocol):
 
     @property
     def initial_nnz(self) -> int:
-        """Active connections that the layer starts training with."""
+        """Active connections at the start of training."""
 
     @property
     def final_nnz(self) -> int:
-        """Active connections that the requested sparsity leaves the layer."""
+        """Active connections at the requested sparsity."""
 
     def mask(self) -> NDArray[np.bool_]:
-        """True where a connection is active; a copy, to do with as one likes."""
+        """True where a connection is active; a copy, which may be changed."""
 
     def dense(self) -> NDArray[np.float32]:
         """The weights, 0 where inactive."""
@@ -52,12 +61,18 @@ class Layer(Protocol):
 
 @dataclass(frozen=True)
 class MaskUpdate:
-    """When an update happens and how far it may go.
+    """When a mask update happens, and how far it may go.
+
+    Example::
+
+        from sb3_sparse.topology import MaskUpdate
+
+        MaskUpdate(step=1000, progress=0.25, begin=0.0, end=1.0, drop_fraction=0.5, seed=0)
 
     :param step: gradient step of the optimizer that owns the network, from 1
     :param progress: environment steps done / planned, in [0, 1]
     :param begin: progress at which updates begin
-    :param end: progress at which they have ended
+    :param end: progress at which updates end
     :param drop_fraction: the drop fraction at the start of training
     :param seed: the policy's mask seed
     """
@@ -72,7 +87,15 @@ class MaskUpdate:
 
 @dataclass(frozen=True)
 class Exchange:
-    """Connections that a layer loses and gains, as ascending flat indices without overlap."""
+    """Connections that a layer loses and gains, as ascending flat indices without overlap.
+
+    Example::
+
+        import numpy as np
+        from sb3_sparse.topology import Exchange
+
+        Exchange(dropped=np.array([3, 7]), grown=np.array([0, 12]))
+    """
 
     dropped: Indices
     grown: Indices
@@ -85,40 +108,67 @@ NOTHING = Exchange(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64))
 
 
 class TopologyMethod(ABC):
-    """A way to move masks. Subclass it (or :class:`DropGrow`) and put ``@register`` on the class.
+    """Base class of methods that move masks. Put ``@register`` on each subclass.
 
-    The class holds no state: everything an exchange depends on is handed to :meth:`exchange`.
+    A method holds no state: :meth:`exchange` receives everything that it may depend on. Use
+    :class:`DropGrow` for methods that drop and grow equally many connections.
+
+    Example::
+
+        import numpy as np
+        from sb3_sparse.topology import NOTHING, Exchange, TopologyMethod, register
+
+        @register
+        class DropLast(TopologyMethod):
+            name = "drop-last"
+
+            def exchange(self, layer, update, *, dense_grad):
+                if layer.nnz <= layer.final_nnz:
+                    return NOTHING
+                last = np.flatnonzero(layer.mask())[-1:]
+                return Exchange(dropped=last, grown=last[:0])
     """
 
     name: ClassVar[str]
-    """What a user writes: ``SparsityCallback(name)``."""
+    """The name that users pass: ``SparsityCallback(name)``."""
     options: ClassVar[frozenset[str]] = frozenset({"update_interval", "begin", "end", "update_on"})
-    """Arguments of the callback that mean something for this method."""
+    """Arguments of the callback that this method uses."""
     default_begin: ClassVar[float] = 0.0
-    """Progress at which updates begin unless the user says otherwise."""
+    """Progress at which updates begin by default."""
     needs_gradient: ClassVar[bool] = False
     """Whether :meth:`exchange` needs the dense gradient."""
     grows: ClassVar[bool] = False
     """Whether connections may be gained."""
     reaches_final: ClassVar[bool] = False
-    """Whether the method takes a denser start to the requested sparsity."""
+    """Whether the method prunes a policy that starts denser to the requested sparsity."""
 
     @abstractmethod
     def exchange(self, layer: Layer, update: MaskUpdate, *, dense_grad: Array | None) -> Exchange:
-        """Decide which connections of one layer move at one update.
+        """Choose the connections of one layer that move at one update.
 
         :param layer: the layer, read only
-        :param update: when, and how much
+        :param update: time and extent of the update
         :param dense_grad: gradient of the loss by every weight, active or not, shape ``(size,)``;
-            None unless :attr:`needs_gradient`
+            None unless :attr:`needs_gradient` is True
         """
 
 
 class DropGrow(TopologyMethod):
     """Drops the active connections of least magnitude and grows as many by a score.
 
-    What may be grown are the inactive connections and the ones just dropped; nnz never changes.
-    The number exchanged follows the cosine schedule of the drop fraction.
+    Candidates for growth are the inactive connections and those just dropped, so nnz never changes.
+    The number of exchanged connections follows the cosine schedule of the drop fraction.
+
+    Example::
+
+        from sb3_sparse.topology import DropGrow, register
+
+        @register
+        class GrowFirst(DropGrow):
+            name = "grow-first"
+
+            def scores(self, layer, update, candidates, *, dense_grad):
+                return -candidates
     """
 
     options = TopologyMethod.options | {"drop_fraction"}
@@ -128,9 +178,12 @@ class DropGrow(TopologyMethod):
     def scores(
         self, layer: Layer, update: MaskUpdate, candidates: Indices, *, dense_grad: Array | None
     ) -> Array:
-        """Score of each candidate; the largest are grown.
+        """Score each candidate; those with the largest scores grow.
 
-        :param candidates: ascending flat indices of the connections that may be grown
+        :param layer: the layer, read only
+        :param update: time and extent of the update
+        :param candidates: ascending flat indices of the connections that may grow
+        :param dense_grad: as in :meth:`exchange`
         :return: shape ``(len(candidates),)``
         """
 

@@ -12,9 +12,18 @@ from sb3_sparse.topology.registry import register
 
 @register
 class Prune(TopologyMethod):
-    """Removes the connections of least magnitude along a cubic ramp; what is pruned stays pruned.
+    """Removes the connections of least magnitude along a cubic ramp, for good.
 
-    Needs a policy that starts denser than it shall end (``initial_sparsity``, usually 0.0).
+    The policy must start denser than it ends (``initial_sparsity``, usually 0.0).
+
+    Example::
+
+        from sb3_sparse import SAC, SparsityCallback
+
+        kwargs = dict(sparsity=0.9, initial_sparsity=0.0)
+        model = SAC("SparsePolicy", "Pendulum-v1", policy_kwargs=kwargs)
+        model.learn(200, callback=SparsityCallback("prune", update_interval=10, begin=0.5, end=0.9))
+
     Source: arXiv:1710.01878.
     """
 

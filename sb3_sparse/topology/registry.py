@@ -1,4 +1,4 @@
-"""The methods known by name."""
+"""The registry of methods by name."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ Method = TypeVar("Method", bound=TopologyMethod)
 
 
 def register(cls: type[Method]) -> type[Method]:
-    """Class decorator that makes a method known as ``cls.name``.
+    """Class decorator: register a method under ``cls.name``.
 
-    :raises ConfigError: if another class has that name already
+    :raises ConfigError: if the class has no name, or if another class has the same one
     """
     name = getattr(cls, "name", None)
     if not isinstance(name, str) or not name:
@@ -29,19 +29,19 @@ def register(cls: type[Method]) -> type[Method]:
 
 
 def _address(cls: type) -> str:
-    """Where a class is defined; the same when its cell or module is run again."""
+    """Where a class is defined; running its notebook cell or module again keeps it."""
     return f"{cls.__module__}.{cls.__qualname__}"
 
 
 def method_names() -> list[str]:
-    """All registered names, sorted."""
+    """The registered names, sorted."""
     return sorted(_METHODS)
 
 
 def method_named(name: str) -> TopologyMethod:
-    """The method of that name.
+    """Look up a method.
 
-    :raises ConfigError: if there is none
+    :raises ConfigError: if no method has that name
     """
     if not isinstance(name, str) or name not in _METHODS:
         raise ConfigError(

@@ -11,7 +11,14 @@ from sb3_sparse.topology.registry import register
 
 @register
 class RigL(DropGrow):
-    """SET with another score: grows where the dense gradient is largest.
+    """Grows the connections with the largest dense gradient; otherwise as SET.
+
+    Example::
+
+        from sb3_sparse import SAC, SparsityCallback
+
+        model = SAC("SparsePolicy", "Pendulum-v1", policy_kwargs=dict(sparsity=0.9))
+        model.learn(200, callback=SparsityCallback("rigl", update_interval=50, drop_fraction=0.5))
 
     Source: arXiv:1911.11134, section 3.
     """

@@ -8,7 +8,17 @@ from sb3_sparse.topology.registry import register
 
 @register
 class Static(TopologyMethod):
-    """A random mask, fixed for the whole of training. Source: arXiv:2206.10369, section 2.1."""
+    """Keeps the initial random mask for the whole training.
+
+    Example::
+
+        from sb3_sparse import SAC, SparsityCallback
+
+        model = SAC("SparsePolicy", "Pendulum-v1", policy_kwargs=dict(sparsity=0.9))
+        model.learn(200, callback=SparsityCallback("static"))
+
+    Source: arXiv:2206.10369, section 2.1.
+    """
 
     name = "static"
     options = frozenset()

@@ -365,7 +365,7 @@ def test_a_layer_that_was_replaced_is_refused_by_name(name):
 
 def test_a_denser_start_without_a_callback_is_no_secret():
     model = make("SAC", policy_kwargs=dict(initial_sparsity=0.0))
-    with pytest.warns(UserWarning, match=r"denser than was asked for.*SparsityCallback\('prune'\)"):
+    with pytest.warns(UserWarning, match=r"denser than requested.*SparsityCallback\('prune'\)"):
         model.learn(40)
 
 

@@ -63,7 +63,7 @@ def test_places_in_another_structure(mask, random):
     ids=["low", "high", "twice", "order", "2d"],
 )
 def test_bad_indices_are_refused(flat):
-    with pytest.raises(CorruptStateError, match="2x3 layer must ascend from 0 to 5"):
+    with pytest.raises(CorruptStateError, match="2x3 layer must ascend strictly within 0 to 5"):
         Structure(np.array(flat), (2, 3))
 
 

@@ -1,1 +1,1 @@
-"""The compiled kernels: C sources, and the one module that calls them."""
+"""The compiled kernels: C sources, and the module that loads them."""

@@ -1,4 +1,4 @@
-"""Loads the compiled kernels; the only module that knows they are C."""
+"""Loads the compiled kernels."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from sb3_sparse.errors import ConfigError, MissingKernels
 
 PATH = Path(__file__).with_name("kernels.so")
 VERSION = 9
-"""Of what the two sides hand each other; ``dispatch.c`` has the same."""
+"""Version of the interface; ``dispatch.c`` has the same number."""
 
 
 def _integers(names: str) -> list[tuple[str, type[ctypes.c_int64]]]:
@@ -42,16 +42,16 @@ class BatchArgument(ctypes.Structure):
 
 
 def bits_of(number: float) -> int:
-    """A double as the integer of the same bits, for structures of which Python fills integers."""
+    """Give a double as the integer of the same bits, for structures filled as integers."""
     found: int = struct.unpack("q", struct.pack("d", number))[0]
     return found
 
 
 @cache
 def library() -> ctypes.CDLL:
-    """The library, set to the best instruction set of this processor.
+    """Load the library and select the best instruction set of this processor.
 
-    :raises MissingKernels: if it was not compiled, or for another version of this package
+    :raises MissingKernels: if it was not compiled, or was compiled for another version
     """
     if ctypes.sizeof(ctypes.c_void_p) != 8:
         raise MissingKernels("this is a 32-bit Python")
@@ -96,7 +96,7 @@ def library() -> ctypes.CDLL:
 
 
 def _share_threads(found: ctypes.CDLL) -> None:
-    """Let the kernels use torch's own OpenMP threads, where torch has OpenMP."""
+    """Make the kernels use torch's own OpenMP threads, if torch has OpenMP."""
     names = ("GOMP_parallel", "omp_get_thread_num", "omp_get_num_threads")
     folder = Path(th.__file__).parent / "lib"
     paths = [path for name in ("gomp", "iomp", "omp") for path in folder.glob(f"lib{name}*")]
@@ -111,7 +111,7 @@ def _share_threads(found: ctypes.CDLL) -> None:
 
 
 def why_missing() -> str | None:
-    """What keeps the kernels from running here; None if nothing does."""
+    """Tell why the kernels cannot run here; None if they can."""
     try:
         library()
     except MissingKernels as error:
@@ -120,12 +120,12 @@ def why_missing() -> str | None:
 
 
 def readable(tensor: th.Tensor) -> bool:
-    """Whether the kernels can read and write a tensor where it lies."""
+    """Whether the kernels can read and write a tensor in place."""
     return tensor.dtype is th.float32 and tensor.is_cpu and tensor.is_contiguous()
 
 
 def instruction_sets() -> list[str]:
-    """The instruction sets that run here, the best first."""
+    """List the instruction sets that run here, best first."""
     found = library()
     names: list[str] = []
     while (name := found.sb3_sparse_instructions(len(names))) is not None:
@@ -137,15 +137,15 @@ _in_use = ""
 
 
 def in_use() -> str:
-    """The instruction set that the kernels use."""
+    """Name the instruction set that the kernels use."""
     library()
     return _in_use
 
 
 def use(name: str) -> None:
-    """Choose another instruction set, for tests and comparisons.
+    """Select another instruction set, for tests and comparisons.
 
-    :raises ConfigError: if it does not run here
+    :raises ConfigError: if the processor does not have it
     """
     if name not in instruction_sets():
         raise ConfigError(
