@@ -3,16 +3,11 @@
 from __future__ import annotations
 
 import stable_baselines3
+import torch as th
 
 from sb3_sparse.algorithms.off_policy import OffPolicy
 from sb3_sparse.algorithms.training import mean, parts
-from sb3_sparse.fused.machine import Machine
 from sb3_sparse.fused.program import Program
-
-METHODS: dict[str, tuple[str, ...]] = {
-    "q_net": ("forward", "extract_features"),
-    "q_net_target": ("forward", "extract_features"),
-}
 
 
 class DQN(OffPolicy, stable_baselines3.DQN):
@@ -27,18 +22,16 @@ class DQN(OffPolicy, stable_baselines3.DQN):
         model.learn(200, callback=SparsityCallback("rigl", update_interval=10))
     """
 
-    def _next_machine(self) -> Machine:
-        self._trains().begin(self, METHODS)
-        return self._machine(self.batch_size, self._find_source())
+    methods = {
+        "q_net": ("forward", "extract_features"),
+        "q_net_target": ("forward", "extract_features"),
+    }
+    follows = False
 
-    def _machine(self, batch_size: int, source: str) -> Machine:
-        return self._trains().machine(
-            (source,), batch_size, [self.policy.optimizer],
-            lambda program: self._record(program, source),
-        )  # fmt: skip
+    def _optimizers(self) -> list[th.optim.Optimizer]:
+        return [self.policy.optimizer]
 
     def _record(self, program: Program, source: str) -> None:
-        """Record one gradient step."""
         batch = self._record_transitions(program, source, self.q_net.features_dim, 1)
         next_q = program.network(parts(self.q_net_target.q_net), batch.next_obs).max_features()
         target_q = batch.rewards + batch.not_done * batch.discounts * next_q
@@ -49,8 +42,8 @@ class DQN(OffPolicy, stable_baselines3.DQN):
 
     def _train_fused(self, gradient_steps: int, batch_size: int = 100) -> None:
         self.policy.set_training_mode(True)
-        self._update_learning_rate(self.policy.optimizer)
-        self._trains().begin(self, METHODS)
+        self._update_learning_rate(self._optimizers())
+        self._begin()
         source = self._find_source()
         losses = []
         for _ in range(gradient_steps):

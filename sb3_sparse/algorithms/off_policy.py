@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from abc import abstractmethod
+from collections.abc import Sequence
+from functools import partial
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_sparse.algorithms.training import Fused, features
+from sb3_sparse.algorithms.training import Fused, Methods, features
+from sb3_sparse.fused.errors import NotCovered
 from sb3_sparse.fused.inputs import TYPES
 from sb3_sparse.fused.machine import Machine
 from sb3_sparse.fused.program import Program
@@ -36,11 +39,43 @@ class Transitions(NamedTuple):
 class OffPolicy(Fused, OffPolicyAlgorithm):
     """Base class of algorithms that learn from a replay buffer by fused gradient steps.
 
-    A subclass defines ``_record`` and ``_train_fused``; docs/gradient_steps.md has an example.
+    docs/gradient_steps.md has an example of a subclass.
     """
 
-    _machine: Callable[..., Machine]
-    """Gives the machine for a batch size, a source and details of the algorithm."""
+    methods: ClassVar[Methods]
+    follows: ClassVar[bool] = True
+    """Whether targets follow by Polyak averaging at each gradient step."""
+
+    @abstractmethod
+    def _optimizers(self, *details: Any) -> list[th.optim.Optimizer]:
+        """The optimizers that take a step."""
+
+    @abstractmethod
+    def _record(self, program: Program, source: str) -> None:
+        """Record one gradient step."""
+
+    def _others(self) -> Sequence[th.Tensor]:
+        """Parameters that are trained besides the policy's."""
+        return ()
+
+    def _begin(self) -> None:
+        """Inspect the model before a round of gradient steps.
+
+        :raises NotCovered: if SB3 must take them
+        """
+        self._trains().begin(self, self.methods, self._others())
+        if self.follows and self.tau >= 1:
+            raise NotCovered("targets that are copies")
+
+    def _next_machine(self) -> Machine:
+        self._begin()
+        return self._machine(self.batch_size, self._find_source())
+
+    def _machine(self, batch: int, source: str, *details: Any) -> Machine:
+        """Give the machine for a batch size, a source and details of the algorithm."""
+        optimizers = self._optimizers(*details)
+        build = partial(self._record, source=source)
+        return self._trains().machine((source,), batch, optimizers, build)
 
     def _find_source(self) -> str:
         """Choose how to read the replay buffer."""

@@ -13,7 +13,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
 from stable_baselines3.common.utils import explained_variance
 
-from sb3_sparse.algorithms.training import Fused, features, parts
+from sb3_sparse.algorithms.training import Fused, Methods, features, parts
 from sb3_sparse.fused.distributions import bernoulli, categorical, gaussian, multi_categorical
 from sb3_sparse.fused.errors import NotCovered
 from sb3_sparse.fused.inputs import TYPES
@@ -24,7 +24,7 @@ from sb3_sparse.fused.values import Value
 from sb3_sparse.policies.internals import samples
 from sb3_sparse.policies.shortcut import takes_vectors
 
-METHODS: dict[str, tuple[str, ...]] = {
+METHODS: Methods = {
     "": ("evaluate_actions", "extract_features", "_get_action_dist_from_latent"),
     "mlp_extractor": ("forward", "forward_actor", "forward_critic"),
 }

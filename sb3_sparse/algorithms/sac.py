@@ -13,15 +13,8 @@ from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN
 from sb3_sparse.algorithms.off_policy import OffPolicy
 from sb3_sparse.algorithms.training import mean, parts
 from sb3_sparse.fused.distributions import least_of, squashed_gaussian
-from sb3_sparse.fused.errors import NotCovered
 from sb3_sparse.fused.machine import Machine
 from sb3_sparse.fused.program import Program
-
-METHODS: dict[str, tuple[str, ...]] = {
-    "actor": ("action_log_prob", "get_action_dist_params", "extract_features"),
-    "critic": ("forward", "extract_features"),
-    "critic_target": ("forward", "extract_features"),
-}
 
 
 class SAC(OffPolicy, stable_baselines3.SAC):
@@ -36,32 +29,20 @@ class SAC(OffPolicy, stable_baselines3.SAC):
         model.learn(200, callback=SparsityCallback("rigl", update_interval=10))
     """
 
+    methods = {
+        "actor": ("action_log_prob", "get_action_dist_params", "extract_features"),
+        "critic": ("forward", "extract_features"),
+        "critic_target": ("forward", "extract_features"),
+    }
+
     def _optimizers(self) -> list[th.optim.Optimizer]:
         optimizers = [self.actor.optimizer, self.critic.optimizer]
         return optimizers + ([self.ent_coef_optimizer] if self.ent_coef_optimizer else [])
 
-    def _begin(self) -> None:
-        """Inspect the model before a round of gradient steps.
-
-        :raises NotCovered: if SB3 must take them
-        """
-        own = () if self.log_ent_coef is None else (self.log_ent_coef,)
-        self._trains().begin(self, METHODS, own)
-        if self.tau >= 1:
-            raise NotCovered("targets that are copies")
-
-    def _next_machine(self) -> Machine:
-        self._begin()
-        return self._machine(self.batch_size, self._find_source())
-
-    def _machine(self, batch_size: int, source: str) -> Machine:
-        return self._trains().machine(
-            (source,), batch_size, self._optimizers(),
-            lambda program: self._record(program, source),
-        )  # fmt: skip
+    def _others(self) -> list[th.Tensor]:
+        return [] if self.log_ent_coef is None else [self.log_ent_coef]
 
     def _record(self, program: Program, source: str) -> None:
-        """Record one gradient step."""
         actor: Any = self.actor
         critic, target = self.critic, self.critic_target
         dim = int(np.prod(self.action_space.shape or ()))

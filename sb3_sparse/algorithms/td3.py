@@ -9,16 +9,7 @@ import torch as th
 from sb3_sparse.algorithms.off_policy import OffPolicy
 from sb3_sparse.algorithms.training import mean, parts
 from sb3_sparse.fused.distributions import least_of
-from sb3_sparse.fused.errors import NotCovered
-from sb3_sparse.fused.machine import Machine
 from sb3_sparse.fused.program import Program
-
-METHODS: dict[str, tuple[str, ...]] = {
-    "actor": ("forward", "extract_features"),
-    "actor_target": ("forward", "extract_features"),
-    "critic": ("forward", "q1_forward", "extract_features"),
-    "critic_target": ("forward", "extract_features"),
-}
 
 
 class TD3(OffPolicy, stable_baselines3.TD3):
@@ -33,28 +24,21 @@ class TD3(OffPolicy, stable_baselines3.TD3):
         model.learn(200, callback=SparsityCallback("rigl", update_interval=10))
     """
 
-    def _begin(self) -> None:
-        """Inspect the model before a round of gradient steps.
+    methods = {
+        "actor": ("forward", "extract_features"),
+        "actor_target": ("forward", "extract_features"),
+        "critic": ("forward", "q1_forward", "extract_features"),
+        "critic_target": ("forward", "extract_features"),
+    }
 
-        :raises NotCovered: if SB3 must take them
+    def _optimizers(self, delayed: bool = True) -> list[th.optim.Optimizer]:
+        """The optimizers that take a step.
+
+        :param delayed: whether the actor's is among them
         """
-        self._trains().begin(self, METHODS)
-        if self.tau >= 1:
-            raise NotCovered("targets that are copies")
-
-    def _next_machine(self) -> Machine:
-        self._begin()
-        return self._machine(self.batch_size, self._find_source(), True)
-
-    def _machine(self, batch_size: int, source: str, delayed: bool) -> Machine:
-        optimizers = [self.critic.optimizer, self.actor.optimizer]
-        return self._trains().machine(
-            (source,), batch_size, optimizers if delayed else optimizers[:1],
-            lambda program: self._record(program, source),
-        )  # fmt: skip
+        return [self.critic.optimizer, self.actor.optimizer][: 2 if delayed else 1]
 
     def _record(self, program: Program, source: str) -> None:
-        """One gradient step; the actor's part is behind the mark."""
         dim = int(np.prod(self.action_space.shape or ()))
         batch = self._record_transitions(program, source, self.actor.features_dim, dim)
         next_action = program.network(parts(self.actor_target.mu), batch.next_obs)
@@ -72,7 +56,7 @@ class TD3(OffPolicy, stable_baselines3.TD3):
         program.log("critic_loss", critic_loss)
         program.minimise(critic_loss, self.critic.optimizer)
 
-        program.mark("delayed")
+        program.mark("delayed")  # the actor's part comes after it
         action = program.network(parts(self.actor.mu), batch.obs)
         q1 = program.network(parts(self.critic.q_networks[0]), program.joined([batch.obs, action]))
         actor_loss = -q1.mean()

@@ -35,6 +35,8 @@ from sb3_sparse.policies.storage import KNOWN
 SEEN = attrgetter("requires_grad", "_backward_hooks", "_post_accumulate_grad_hooks")
 KNOWN_MODULES = (nn.Linear, SparseLinear, nn.Identity, *ACTIVATIONS)
 Build = Callable[[Program], None]
+Methods = dict[str, tuple[str, ...]]
+"""The methods that SB3's ``train()`` calls, by the dotted name of their module ("": the policy)."""
 
 
 class Training:
@@ -65,14 +67,13 @@ class Training:
     def begin(
         self,
         model: BaseAlgorithm,
-        methods: dict[str, tuple[str, ...]],
+        methods: Methods,
         others: Sequence[th.Tensor] = (),
     ) -> None:
         """Inspect the policy of a model before a round of gradient steps.
 
         :param model: the model
-        :param methods: the methods that SB3's ``train()`` calls, by the dotted name of their module
-            ("": the policy)
+        :param methods: the methods that SB3's ``train()`` calls
         :param others: parameters that are trained besides the policy's
         :raises NotCovered: if skipping these methods would change the result
         """
@@ -149,7 +150,7 @@ class Training:
         return machine
 
 
-def _check_policy(policy: BaseSparsePolicy, methods: dict[str, tuple[str, ...]]) -> None:
+def _check_policy(policy: BaseSparsePolicy, methods: Methods) -> None:
     if (missing := why_missing()) is not None:
         raise NotCovered(f"there are no kernels: {missing}")
     if policy.device.type != "cpu":

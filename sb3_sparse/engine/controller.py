@@ -15,11 +15,7 @@ from sb3_sparse.engine.auto import AutoCompute
 from sb3_sparse.engine.foreign import watch
 from sb3_sparse.engine.hooks import Hooks
 from sb3_sparse.engine.network import SparseNetwork
-from sb3_sparse.engine.optimizers import (
-    acts_elementwise,
-    add_weight_decay,
-    keep_implementation,
-)
+from sb3_sparse.engine.optimizers import acts_elementwise, add_weight_decay, keep_implementation
 from sb3_sparse.engine.plan import Plan, warn_of_no_plan
 from sb3_sparse.engine.sequential import chain_up
 from sb3_sparse.engine.storage import LayerStorage, check_masked, save_moments
@@ -86,6 +82,9 @@ class Controller:
     def _owned_by(self, optimizer: th.optim.Optimizer) -> list[SparseNetwork]:
         return [network for network in self.networks if network.optimizer is optimizer]
 
+    def _sparse_layers(self, networks: Iterable[SparseNetwork]) -> Iterable[LayerStorage]:
+        return chain.from_iterable(network.sparse_layers for network in networks)
+
     def attach(self) -> None:
         """Register the hooks, unless these very weights and optimizers have them already."""
         changed = self._attach_to_gradients()
@@ -94,7 +93,7 @@ class Controller:
 
     def _attach_to_gradients(self) -> bool:
         """Register the hooks on gradients alone; tell whether they were missing."""
-        layers = chain.from_iterable(network.sparse_layers for network in self.networks)
+        layers = self._sparse_layers(self.networks)
         weights = [layer.weight for layer in layers if not layer.frozen]
         return self._gradient_hooks.attach(weights, self._hook_gradients)
 
@@ -169,21 +168,21 @@ class Controller:
         self.choose_storage(root)
         if not self._in_force():
             self.plan = None  # left from an interrupted training
-        for layer in self.layers:
+        for layer in self._sparse_layers(self.networks):
             if layer.gradient is not None:
                 layer.gradient.dense_grad = None
-        for network in self.networks:
-            network.settle(self.soft_targets)
+            layer.remask()
+            layer.settle_targets(self.soft_targets)
 
     def enforce(self) -> None:
         """Set inactive weights to 0, whoever wrote them."""
-        for network in self.networks:
-            network.remask()
+        for layer in self._sparse_layers(self.networks):
+            layer.remask()
 
     def notice(self) -> None:
         """As :meth:`enforce`, but only for weights that torch has seen written since."""
-        for network in self.networks:
-            network.notice()
+        for layer in self._sparse_layers(self.networks):
+            layer.notice()
 
     def start(self, plan: Plan, soft_targets: bool, in_force: Callable[[], bool]) -> None:
         """Start moving masks.
@@ -239,13 +238,13 @@ class Controller:
 
     def _trust(self, optimizer: th.optim.Optimizer, args: object, kwargs: object) -> None:
         """Runs after the step of an optimizer that keeps weights at 0 whose gradient is 0."""
-        for network in self._owned_by(optimizer):
-            network.trust()
+        for layer in self._sparse_layers(self._owned_by(optimizer)):
+            layer.trust()
 
     def _after_step(self, optimizer: th.optim.Optimizer, args: object, kwargs: object) -> None:
         """Runs after the step of an optimizer that writes to inactive weights."""
-        for network in self._owned_by(optimizer):
-            network.remask()
+        for layer in self._sparse_layers(self._owned_by(optimizer)):
+            layer.remask()
 
     def awaits(self, optimizer: th.optim.Optimizer) -> bool:
         """Whether the optimizer's next step needs more than the step, e.g. a mask update."""

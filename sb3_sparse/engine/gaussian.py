@@ -21,14 +21,9 @@ def gaussian(
     """
     n, size = mean.shape
     room = Room(n * size + n)
-    if library().sb3_sparse_gaussian(
-        n,
-        size,
-        mean.data_ptr(),
-        log_std.data_ptr(),
-        None if noise is None else noise.data_ptr(),
-        room.memory,
-    ):
+    drawn = None if noise is None else noise.data_ptr()
+    call = library().sb3_sparse_gaussian
+    if call(n, size, mean.data_ptr(), log_std.data_ptr(), drawn, room.memory):
         return None
     return room.tensor((n, size), 0), room.tensor((n,), n * size)
 
@@ -47,13 +42,8 @@ def squashed(
     """
     size = mean.numel()
     room = Room(2 * size)
-    if library().sb3_sparse_squashed(
-        size,
-        *bounds,
-        mean.data_ptr(),
-        log_std.data_ptr(),
-        None if noise is None else noise.data_ptr(),
-        room.memory,
-    ):
+    drawn = None if noise is None else noise.data_ptr()
+    call = library().sb3_sparse_squashed
+    if call(size, *bounds, mean.data_ptr(), log_std.data_ptr(), drawn, room.memory):
         return None
     return room.tensor(mean.shape, 0), room.tensor(mean.shape, size)

@@ -289,10 +289,7 @@ class FunctionalGradient(MaskedGradient):
 
 
 def follow_mask(
-    grad: th.Tensor | None,
-    dense_grad: th.Tensor | None,
-    old_mask: th.Tensor,
-    new_mask: th.Tensor,
+    grad: th.Tensor | None, dense_grad: th.Tensor | None, old_mask: th.Tensor, new_mask: th.Tensor
 ) -> None:
     """Adapt the gradient of the next step to a mask that has just changed.
 

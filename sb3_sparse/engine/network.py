@@ -67,30 +67,6 @@ class SparseNetwork:
         """Layers with connections that are inactive or may become so."""
         return [layer for layer in self.layers if not layer.always_full]
 
-    def remask(self) -> None:
-        """Set inactive weights to 0."""
-        for layer in self.sparse_layers:
-            layer.remask()
-
-    def notice(self) -> None:
-        """As :meth:`remask`, but only for weights that torch has seen written since."""
-        for layer in self.sparse_layers:
-            layer.notice()
-
-    def trust(self) -> None:
-        """Note that the writes counted so far kept inactive weights at 0."""
-        for layer in self.sparse_layers:
-            layer.trust()
-
-    def settle(self, soft_targets: bool) -> None:
-        """Bring weights and targets in line with the masks before a round of training.
-
-        :param soft_targets: whether targets follow a mask at once
-        """
-        for layer in self.sparse_layers:
-            layer.remask()
-            layer.settle_targets(soft_targets)
-
     @property
     def size(self) -> int:
         """Connections of the dense network, within the budget."""

@@ -41,7 +41,7 @@ class SparseStorage(LayerStorage):
         self.module.check_mask = self.check_mask
         self._targets = []
         self._hooks = [
-            self.module.register_load_state_dict_post_hook(self._after_load),  # type: ignore[no-untyped-call]
+            self.module.register_load_state_dict_post_hook(self._after_load)  # type: ignore[no-untyped-call]
         ]
         for target in layer.targets:
             assert isinstance(target, nn.Linear)

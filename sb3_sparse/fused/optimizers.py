@@ -41,18 +41,9 @@ def _adam(
     return [0, *map(bits_of, map(float, numbers)), int(decoupled)]
 
 
+_COMMON = ("maximize", "capturable", "differentiable")
 _ADAM = Known(
-    (
-        "lr",
-        "betas",
-        "eps",
-        "weight_decay",
-        "decoupled_weight_decay",
-        "amsgrad",
-        "maximize",
-        "capturable",
-        "differentiable",
-    ),
+    ("lr", "betas", "eps", "weight_decay", "decoupled_weight_decay", "amsgrad", *_COMMON),
     _adam,
     ("exp_avg", "exp_avg_sq"),
 )
@@ -75,17 +66,7 @@ def rmsprop(kind: int) -> Callable[..., list[int] | None]:
 
 
 _RMSPROP = Known(
-    (
-        "lr",
-        "alpha",
-        "eps",
-        "weight_decay",
-        "momentum",
-        "centered",
-        "maximize",
-        "capturable",
-        "differentiable",
-    ),
+    ("lr", "alpha", "eps", "weight_decay", "momentum", "centered", *_COMMON),
     rmsprop(1),
     ("", "square_avg"),
 )
@@ -164,11 +145,7 @@ class Steps:
         first, second = self._known.moments
         steps = state["step"]
         self.counts = not isinstance(steps, th.Tensor)
-        return (
-            state[first] if first else None,
-            state[second],
-            None if self.counts else steps,
-        )
+        return (state[first] if first else None, state[second], None if self.counts else steps)
 
     def count(self) -> None:
         """Count a step of the kernels where they cannot count it."""

@@ -7,40 +7,16 @@ Example::
     active_counts([(256, 17), (256, 256), (6, 256)], sparsity=0.9)  # [1951, 3658, 1536]
 """
 
-from sb3_sparse.sparsity.budgets import feasible_actor_share, split_sparsity
-from sb3_sparse.sparsity.distributions import (
-    DISTRIBUTIONS,
-    active_counts,
-    check_distribution,
-    check_sparsity,
-)
-from sb3_sparse.sparsity.initialisation import (
-    glorot_limits,
-    random_mask,
-    sparsity_aware_weights,
-)
+from sb3_sparse.sparsity.budgets import split_sparsity
+from sb3_sparse.sparsity.distributions import active_counts
+from sb3_sparse.sparsity.initialisation import random_mask, sparsity_aware_weights
 from sb3_sparse.sparsity.randomness import random_bits, random_uniform
 from sb3_sparse.sparsity.schedules import cosine_drop_fraction, pruned_count
 from sb3_sparse.sparsity.selection import Indices, largest, least_magnitude
 from sb3_sparse.sparsity.widths import equivalent_widths, mlp_parameters
 
 __all__ = [
-    "DISTRIBUTIONS",
-    "Indices",
-    "active_counts",
-    "check_distribution",
-    "check_sparsity",
-    "cosine_drop_fraction",
-    "equivalent_widths",
-    "feasible_actor_share",
-    "glorot_limits",
-    "largest",
-    "least_magnitude",
-    "mlp_parameters",
-    "pruned_count",
-    "random_bits",
-    "random_mask",
-    "random_uniform",
-    "sparsity_aware_weights",
-    "split_sparsity",
-]
+    "Indices", "active_counts", "cosine_drop_fraction", "equivalent_widths", "largest",
+    "least_magnitude", "mlp_parameters", "pruned_count", "random_bits", "random_mask",
+    "random_uniform", "sparsity_aware_weights", "split_sparsity",
+]  # fmt: skip

@@ -28,29 +28,18 @@ class Layer(Protocol):
             return int(np.where(layer.mask(), np.abs(layer.dense()), np.inf).argmin())
     """
 
-    @property
-    def name(self) -> str:
-        """Dotted name within the policy."""
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """The weight's shape, ``(out, in, *kernel)``."""
-
-    @property
-    def size(self) -> int:
-        """Connections of the dense layer."""
-
-    @property
-    def nnz(self) -> int:
-        """Active connections now."""
-
-    @property
-    def initial_nnz(self) -> int:
-        """Active connections at the start of training."""
-
-    @property
-    def final_nnz(self) -> int:
-        """Active connections at the requested sparsity."""
+    name: str
+    """Dotted name within the policy."""
+    shape: tuple[int, ...]
+    """The weight's shape, ``(out, in, *kernel)``."""
+    size: int
+    """Connections of the dense layer."""
+    nnz: int
+    """Active connections now."""
+    initial_nnz: int
+    """Active connections at the start of training."""
+    final_nnz: int
+    """Active connections at the requested sparsity."""
 
     def mask(self) -> NDArray[np.bool_]:
         """True where a connection is active; a copy, which may be changed."""

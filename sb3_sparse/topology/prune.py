@@ -16,14 +16,6 @@ class Prune(TopologyMethod):
 
     The policy must start denser than it ends (``initial_sparsity``, usually 0.0).
 
-    Example::
-
-        from sb3_sparse import SAC, SparsityCallback
-
-        kwargs = dict(sparsity=0.9, initial_sparsity=0.0)
-        model = SAC("SparsePolicy", "Pendulum-v1", policy_kwargs=kwargs)
-        model.learn(200, callback=SparsityCallback("prune", update_interval=10, begin=0.5, end=0.9))
-
     Source: arXiv:1710.01878.
     """
 

@@ -13,13 +13,6 @@ from sb3_sparse.topology.registry import register
 class RigL(DropGrow):
     """Grows the connections with the largest dense gradient; otherwise as SET.
 
-    Example::
-
-        from sb3_sparse import SAC, SparsityCallback
-
-        model = SAC("SparsePolicy", "Pendulum-v1", policy_kwargs=dict(sparsity=0.9))
-        model.learn(200, callback=SparsityCallback("rigl", update_interval=50, drop_fraction=0.5))
-
     Source: arXiv:1911.11134, section 3.
     """
 

@@ -12,13 +12,6 @@ from sb3_sparse.topology.registry import register
 class SET(DropGrow):
     """Grows connections uniformly at random.
 
-    Example::
-
-        from sb3_sparse import SAC, SparsityCallback
-
-        model = SAC("SparsePolicy", "Pendulum-v1", policy_kwargs=dict(sparsity=0.9))
-        model.learn(200, callback=SparsityCallback("set", update_interval=50, drop_fraction=0.5))
-
     Source: arXiv:1707.04780, with the cosine decay of arXiv:1907.04840 as in arXiv:2206.10369.
     """
 

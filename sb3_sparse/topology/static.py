@@ -10,13 +10,6 @@ from sb3_sparse.topology.registry import register
 class Static(TopologyMethod):
     """Keeps the initial random mask for the whole training.
 
-    Example::
-
-        from sb3_sparse import SAC, SparsityCallback
-
-        model = SAC("SparsePolicy", "Pendulum-v1", policy_kwargs=dict(sparsity=0.9))
-        model.learn(200, callback=SparsityCallback("static"))
-
     Source: arXiv:2206.10369, section 2.1.
     """
 

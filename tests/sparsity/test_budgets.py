@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sb3_sparse.errors import ConfigError
-from sb3_sparse.sparsity import feasible_actor_share, split_sparsity
+from sb3_sparse.sparsity.budgets import feasible_actor_share, split_sparsity
 
 ACTOR = 17 * 256 + 256 * 256 + 256 * (6 + 6)  # 72960
 CRITICS = 2 * (23 * 256 + 256 * 256 + 256 * 1)  # 143360

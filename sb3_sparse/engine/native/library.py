@@ -6,6 +6,7 @@ import ctypes
 import struct
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import torch as th
 
@@ -47,6 +48,18 @@ def bits_of(number: float) -> int:
     return found
 
 
+_INT, _LONG, _DOUBLE, _ADDRESS = ctypes.c_int, ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
+_SIGNATURES: dict[str, tuple[Any, list[Any]]] = {
+    "act": (_INT, [_ADDRESS, _LONG, _LONG, _INT, _ADDRESS, _ADDRESS]),
+    "fused": (_LONG, [_ADDRESS, _LONG, _LONG]),
+    "clear": (None, [_ADDRESS, _ADDRESS, _LONG]),
+    "gaussian": (_INT, [_LONG, _LONG, *(_ADDRESS,) * 4]),
+    "box": (None, [_INT, _LONG, _LONG, *(_ADDRESS,) * 4]),
+    "squashed": (_INT, [_LONG, _DOUBLE, _DOUBLE, *(_ADDRESS,) * 4]),
+}
+"""Type of the result and of the arguments of each function of the library."""
+
+
 @cache
 def library() -> ctypes.CDLL:
     """Load the library and select the best instruction set of this processor.
@@ -66,30 +79,10 @@ def library() -> ctypes.CDLL:
         raise MissingKernels(f"the library does not load ({error})") from error
     if version != VERSION:
         raise MissingKernels(f"the library has version {version}, this package {VERSION}")
+    for name, (result, arguments) in _SIGNATURES.items():
+        function = getattr(found, f"sb3_sparse_{name}")
+        function.restype, function.argtypes = result, arguments
     found.sb3_sparse_instructions.restype = ctypes.c_char_p
-    found.sb3_sparse_act.argtypes = [
-        ctypes.c_void_p,
-        ctypes.c_int64,
-        ctypes.c_int64,
-        ctypes.c_int,
-        ctypes.c_void_p,
-        ctypes.c_void_p,
-    ]
-    found.sb3_sparse_fused.restype = ctypes.c_int64
-    found.sb3_sparse_fused.argtypes = [ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64]
-    found.sb3_sparse_clear.argtypes = [ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64]
-    found.sb3_sparse_gaussian.argtypes = [*(ctypes.c_int64,) * 2, *(ctypes.c_void_p,) * 4]
-    found.sb3_sparse_box.argtypes = [
-        ctypes.c_int,
-        *(ctypes.c_int64,) * 2,
-        *(ctypes.c_void_p,) * 4,
-    ]
-    found.sb3_sparse_box.restype = None
-    found.sb3_sparse_squashed.argtypes = [
-        ctypes.c_int64,
-        *(ctypes.c_double,) * 2,
-        *(ctypes.c_void_p,) * 4,
-    ]
     _use(found, found.sb3_sparse_instructions(0).decode())
     _share_threads(found)
     return found
