@@ -94,7 +94,7 @@ def test_several_gradients_at_once_are_seen():
     seen = []
     x = th.zeros(2, requires_grad=True)
     y = x * 1
-    y.register_hook(lambda grad: seen.append(of_torch.stands_for_many(grad)))
+    y.register_hook(lambda grad: seen.append(of_torch.is_batched(grad)))
     y.sum().backward(retain_graph=True)
     th.autograd.grad(y, x, th.eye(2), is_grads_batched=True)
     assert seen == [False, True]

@@ -44,7 +44,7 @@ class A2C(OnPolicy, stable_baselines3.A2C):
         machine.set(self._coefficients())
         for part in self._minibatches(None):
             self._hand_over(machine, part)
-            machine.run(0, None, partial(self._refuse, part))
+            machine.run(0, None, partial(self._raise_error, part))
         self._n_updates += 1
         record = self.logger.record
         record("train/n_updates", self._n_updates, exclude="tensorboard")

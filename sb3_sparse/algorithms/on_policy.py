@@ -165,7 +165,7 @@ class OnPolicy(Fused, OnPolicyAlgorithm):
             {name: (getattr(buffer, array), at) for name, array in ARRAYS.items()}, lead=1
         )
 
-    def _refuse(self, part: Minibatch, check: str) -> None:
+    def _raise_error(self, part: Minibatch, check: str) -> None:
         """Let SB3's distribution raise its error, for means that are not finite say."""
         data, buffer = part.data, self.rollout_buffer
         if data is None:

@@ -91,7 +91,7 @@ class PPO(OnPolicy, stable_baselines3.PPO):
                 machine.set(settings)
                 self._hand_over(machine, part)
                 step = machine.steps[0] if self.target_kl is not None else None
-                machine.run(0, step, partial(self._refuse, part))
+                machine.run(0, step, partial(self._raise_error, part))
                 for name, title in LOGGED.items():
                     logged[title].append(machine.number(name))
                 divergence = machine.number("approx_kl")

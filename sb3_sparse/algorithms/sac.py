@@ -111,7 +111,7 @@ class SAC(OffPolicy, stable_baselines3.SAC):
             last = (
                 None if step % self.target_update_interval == 0 else machine.marks["target update"]
             )
-            machine.run(0, last, partial(self._refuse, machine, data))
+            machine.run(0, last, partial(self._raise_error, machine, data))
             for name in machine.program.logged:
                 logged.setdefault(name, []).append(machine.number(name))
         self._n_updates += gradient_steps
@@ -120,7 +120,7 @@ class SAC(OffPolicy, stable_baselines3.SAC):
             if name in logged:
                 self.logger.record(f"train/{name}", mean(logged[name]))
 
-    def _refuse(self, machine: Machine, data: Any, noise: str) -> None:
+    def _raise_error(self, machine: Machine, data: Any, noise: str) -> None:
         """Let SB3's distribution raise its error, for means that are not finite say."""
         obs = self._observations(machine, data, next_ones=noise == "next_noise")
         with th.no_grad(), th.random.fork_rng(devices=[]):

@@ -55,7 +55,7 @@ class Training:
         self._prepared: Machine | None = None
         self.reason: str | None = None
         """Reason why SB3 took the last gradient steps; None: they were fused."""
-        self.said: set[str] = set()
+        self.logged: set[str] = set()
         """Reasons that have been logged."""
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Training:
@@ -310,7 +310,7 @@ class Fused(BaseAlgorithm):
         """Log once why gradient steps are SB3's own, if the policy is sparse."""
         training = self._trains()
         training.reason = reason = why.reason
-        if reason not in training.said:
-            training.said.add(reason)
+        if reason not in training.logged:
+            training.logged.add(reason)
             if isinstance(unwrapped(self.policy), BaseSparsePolicy):
                 self.logger.info(f"Gradient steps are Stable-Baselines3's own: {reason}")

@@ -175,7 +175,7 @@ class Controller:
             layer.settle_targets(self.soft_targets)
 
     def enforce(self) -> None:
-        """Set inactive weights to 0, whoever wrote them."""
+        """Set inactive weights to 0 in case they have been written."""
         for layer in self._sparse_layers(self.networks):
             layer.remask()
 

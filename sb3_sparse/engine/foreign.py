@@ -78,7 +78,7 @@ def _before_step(optimizer: th.optim.Optimizer, args: object, kwargs: object) ->
         if layer.is_sparse and since is not layer.connections and not acts_elementwise(optimizer):
             raise UnsupportedError(
                 f"the connections of {layer.name} have moved, and {type(optimizer).__name__} does "
-                "not move each weight by itself, so what it remembers cannot follow them; make a "
+                "not move each weight by itself, so its moments cannot follow them; make a "
                 "new optimizer after the mask has moved, or the policy with compute='masked'"
             )
         layer.follow(optimizer, since)

@@ -2,7 +2,7 @@
 
 In a rollout a layer takes a few microseconds of arithmetic and more than that of torch's overhead.
 Here one call takes an observation through every layer, activation and head, without a graph. It
-reads masked layers through their masks, so inactive weights count as 0 whoever wrote them.
+reads masked layers through their masks, so inactive weights always count as 0.
 """
 
 from __future__ import annotations

@@ -44,7 +44,7 @@ module_hooks: Any = itemgetter(*MODULE_HOOKS)
 
 
 def watching() -> bool:
-    """Whether somebody wants to see single operations: tracing, dispatch modes, torch.func."""
+    """Whether single operations are observed: by tracing, dispatch modes or torch.func."""
     return (
         th._C._get_tracing_state() is not None
         or th._C._len_torch_dispatch_stack() > 0
@@ -53,7 +53,7 @@ def watching() -> bool:
     )
 
 
-def stands_for_many(gradient: th.Tensor) -> bool:
+def is_batched(gradient: th.Tensor) -> bool:
     """Whether a gradient is several at once, as in ``is_grads_batched`` and ``torch.func``."""
     kinds = th._C._functorch
     return bool(kinds.is_legacy_batchedtensor(gradient) or kinds.is_batchedtensor(gradient))
@@ -69,8 +69,8 @@ def step_hooks(optimizer: th.optim.Optimizer) -> list[dict[Any, Any]]:
 def become(module: nn.Module, cls: type[Module]) -> Module:
     """Change a module's class in place, as torch's parametrizations do.
 
-    Whoever holds the module, its Parameters or hooks on them keeps what he has; a new module in its
-    place would be another object to optimizers, hooks and the user.
+    References to the module, its Parameters and their hooks stay valid, unlike those to a module
+    that is replaced by a new one.
     """
     module.__class__ = cls
     assert isinstance(module, cls)

@@ -16,7 +16,7 @@ from torch import nn
 from torch.nn import functional
 
 from sb3_sparse.engine.activations import number_of
-from sb3_sparse.engine.internals import stands_for_many
+from sb3_sparse.engine.internals import is_batched
 from sb3_sparse.engine.native.library import BatchArgument, LayerArgument, library, readable
 from sb3_sparse.engine.structure import Structure
 from sb3_sparse.errors import UnsupportedError
@@ -230,7 +230,7 @@ class Products(th.autograd.Function):
         needs = ctx.needs_input_grad[1:]
         # TRPO needs a differentiable gradient, and torch.func several at once.
         again = th.is_grad_enabled()
-        if again or stands_for_many(gradients[0]):
+        if again or is_batched(gradients[0]):
             with th.enable_grad():
                 result = how.by_dense_weights(x, parameters)
             wanted = [tensor for tensor, need in zip((x, *parameters), needs, strict=True) if need]

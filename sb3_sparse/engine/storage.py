@@ -1,4 +1,4 @@
-"""One layer's connections, behind an interface that hides how they are stored."""
+"""Base class of storages, which hide how a layer's connections are kept."""
 
 from __future__ import annotations
 
@@ -167,7 +167,7 @@ class LayerStorage(ABC):
     def _gradient_mask(self, functional: bool, capturing: Callable[[], bool]) -> GradientMask: ...
 
     def note_gradient(self, dense_grad: th.Tensor) -> None:
-        """Take the dense gradient of the next step from somebody who has computed it."""
+        """Take the dense gradient of the next step from whatever has computed it."""
         if self.gradient is not None:
             self.gradient.dense_grad = lambda: dense_grad
 
@@ -227,13 +227,13 @@ class LayerStorage(ABC):
         if (
             not mask[dropped].all()
             or mask[grown].any()
-            or left != self.nnz - dropped.size + grown.size  # an index stands twice
+            or left != self.nnz - dropped.size + grown.size  # an index is repeated
             or left == 0
         ):
             raise TopologyError(
                 f"the exchange for {self.name} drops {dropped.size} and grows {grown.size} of "
                 f"{self.nnz} connections, but some of the dropped are not active, some of the "
-                "grown are, an index stands twice, or no connection would be left"
+                "grown are, an index is repeated, or no connection would be left"
             )
         self._move(after, optimizers, soft_targets, dense_grad)
 
