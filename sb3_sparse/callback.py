@@ -1,4 +1,4 @@
-"""The callback that says how masks may move."""
+"""The callback that moves masks."""
 
 from __future__ import annotations
 
@@ -15,15 +15,23 @@ from sb3_sparse.topology import method_named
 
 
 class SparsityCallback(BaseCallback):
-    """Moves the masks of a sparse policy while it trains, and logs how sparse it is.
+    """Moves the masks of a sparse policy while it trains, and logs its sparsity.
 
-    Holds no state of its own: to resume, load the model and pass the same callback again. Without
-    it masks stay as they are, which is static sparse training.
+    To resume a training, load the model and pass the same callback again. Without a callback masks
+    stay as they are, which is static sparse training.
 
     Logged: ``sparsity/total``, ``sparsity/<network>``, ``sparsity/nnz``, ``sparsity/mask_updates``,
     ``sparsity/mask_churn`` (share of the active connections that the last update dropped),
     ``sparsity/drop_fraction`` and ``sparsity/sparse_storage_layers`` (how many layers store their
     active connections only).
+
+    Example::
+
+        from sb3_sparse import SAC, SparsityCallback
+
+        kwargs = dict(sparsity=0.9, net_arch=[32, 32])
+        model = SAC("SparsePolicy", "Pendulum-v1", learning_starts=10, policy_kwargs=kwargs)
+        model.learn(40, callback=SparsityCallback("rigl", update_interval=10))
 
     :param method: ``"static"``, ``"set"``, ``"rigl"``, ``"prune"`` or a registered one
     :param update_interval: gradient steps of a network's own optimizer between two updates
@@ -99,14 +107,14 @@ class SparsityCallback(BaseCallback):
                 f"and method {self.plan.method!r} would never take it to its sparsity; use "
                 "'prune', or leave initial_sparsity out"
             )
-        policy.sparse.plan = None  # of a training that was interrupted
+        policy.sparse.plan = None  # left by an interrupted training
 
     def _on_training_start(self) -> None:
         sparse = self._sparse_policy().sparse
         if sparse.plan is not None:
             sparse.plan = None
             raise ConfigError("two SparsityCallbacks are at work on one model; keep one")
-        model, began = self.model, self.model.start_time  # which every learn() sets anew
+        model, began = self.model, self.model.start_time  # every learn() sets it anew
         sparse.start(
             self.plan,
             soft_targets=getattr(model, "tau", 1.0) < 1.0,
@@ -130,7 +138,7 @@ class SparsityCallback(BaseCallback):
         self._note_progress()
         sparse = self._sparse_policy().sparse
         if sparse.plan is None:
-            return  # rl_zoo3 calls this twice
+            return  # rl_zoo3 calls it twice
         sparse.stop()
         self._log()
         self._warn_if_nothing_was_due()

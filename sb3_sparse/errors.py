@@ -1,4 +1,4 @@
-"""Exceptions: what a user can do wrong, said in one sentence that names the cure."""
+"""Exceptions and warnings. Each message is one sentence that says what to do."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
 
 BETWEEN = {"sb3_sparse", "stable_baselines3", "sb3_contrib", "rl_zoo3", "optuna", "torch"}
-"""Packages whose code may run between a line of the user's and the place that warns."""
+"""Packages whose code may run between a line of the user and the warning."""
 
 
 def did_you_mean(name: object, known: Iterable[str]) -> str:
-    """What to add to a message on an unknown name: the nearest known one, or nothing.
+    """The nearest known name, to be added to a message about an unknown one; empty if none.
 
-    :param name: what was given, of any type
-    :param known: what is allowed
+    :param name: the unknown name, of any type
+    :param known: allowed names
     """
     by_spelling = {one.lower(): one for one in known}
     close = get_close_matches(str(name).lower(), by_spelling, n=1)
@@ -24,22 +24,22 @@ def did_you_mean(name: object, known: Iterable[str]) -> str:
 
 
 def command(*words: object) -> str:
-    """A command of this package, as a shell takes it: names with spaces are quoted."""
+    """A command of this package for a shell, with words quoted where necessary."""
     return shlex.join(["sb3-sparse", *map(str, words)])
 
 
 class SparsityError(Exception):
-    """Base of every error that this package raises on purpose."""
+    """Base class of all errors that this package raises on purpose."""
 
 
 class SparsityWarning(UserWarning):
-    """Training goes on, but perhaps not as you meant it; the message says what to change."""
+    """Training continues, but perhaps not as intended; the message says what to change."""
 
 
 def warn(message: str) -> None:
-    """Give a :class:`SparsityWarning` at the line of the user's code that led to it.
+    """Issue a :class:`SparsityWarning` at the line of the user's code that led to it.
 
-    Python prints that line below the message; one of this package or of SB3 would explain nothing.
+    Python prints that line below the message; a line of this package or of SB3 would not help.
 
     :param message: what happened, and what to change
     """
@@ -54,41 +54,41 @@ def _package_of(namespace: Mapping[str, object]) -> str:
 
 
 class ConfigError(SparsityError, ValueError):
-    """A value is outside of what is allowed; the message says what is."""
+    """A value is not allowed; the message says which are."""
 
 
 class RunBusy(ConfigError):
-    """Another process is at work in a run's folder."""
+    """Another process is using a run's folder."""
 
 
 class TuningFailed(SparsityError, RuntimeError):
-    """No trial of a study came to its end."""
+    """No trial of a search finished."""
 
 
 class Unwritable(SparsityError, OSError):
-    """A disk is full, or a folder cannot be written to."""
+    """A disk is full, or a folder is not writable."""
 
 
 class UnsupportedError(SparsityError, TypeError):
-    """An algorithm, layer or space that sparse training does not cover."""
+    """Sparse training does not support an algorithm, layer or space."""
 
 
 class Diverged(SparsityError, ArithmeticError):
-    """A training whose networks hold values that are not finite."""
+    """Networks hold values that are not finite."""
 
 
 class CorruptStateError(SparsityError, RuntimeError):
-    """A saved state contradicts itself or does not belong to this policy.
+    """A saved state is inconsistent or does not belong to this policy.
 
-    No ``ValueError``: SB3's ``load`` takes that for a file of an old version of its own.
+    It is not a ``ValueError``, which SB3's ``load`` takes for a file of an old version.
     """
 
 
 class MissingExtra(SparsityError, ImportError):
-    """An optional dependency is absent.
+    """An optional dependency is not installed.
 
-    :param what: what the user tried to do, e.g. ``"the command line"``
-    :param extra: name of the extra that brings the dependency
+    :param what: what needs it, e.g. ``"the command line"``
+    :param extra: name of the extra that installs it
     """
 
     def __init__(self, what: str, extra: str) -> None:
@@ -96,7 +96,7 @@ class MissingExtra(SparsityError, ImportError):
 
 
 class TopologyError(SparsityError, RuntimeError):
-    """A topology method asked for an exchange that no mask allows."""
+    """A topology method returned an exchange that the mask does not allow."""
 
 
 class MissingKernels(SparsityError, ImportError):

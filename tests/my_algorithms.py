@@ -10,7 +10,7 @@ from stable_baselines3.sac.policies import Actor
 from torch.nn import functional as F
 
 from sb3_sparse import NetworkSpec, PassCounts, SparseSACPolicy, register_policy
-from sb3_sparse.policies.gaussian import GaussianActor
+from sb3_sparse.policies.gaussian_actor import GaussianActor
 
 
 class CautiousSAC(stable_baselines3.SAC):

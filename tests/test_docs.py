@@ -32,26 +32,7 @@ from sb3_sparse.zoo.training import train
 ROOT = Path(__file__).parent.parent
 DOORS = ["", ".algorithms", ".analysis", ".compress", ".export", ".fused", ".networks", ".report"]
 DOORS += [".sparsity", ".studies", ".topology", ".tuning", ".zoo"]
-WITHOUT_EXAMPLE = {
-    "sb3_sparse.BaseSparsePolicy",
-    "sb3_sparse.NetworkSpec",
-    "sb3_sparse.PassCounts",
-    "sb3_sparse.SparseActorCriticPolicy",
-    "sb3_sparse.SparseCrossQPolicy",
-    "sb3_sparse.SparseDQNPolicy",
-    "sb3_sparse.SparseQRDQNPolicy",
-    "sb3_sparse.SparseSACPolicy",
-    "sb3_sparse.SparseTD3Policy",
-    "sb3_sparse.SparseTQCPolicy",
-    "sb3_sparse.SparsityCallback",
-    "sb3_sparse.analysis.DormantShare",
-    "sb3_sparse.analysis.FlopsReport",
-    "sb3_sparse.analysis.GradientSNR",
-    "sb3_sparse.analysis.GradientSNRCallback",
-    "sb3_sparse.analysis.LayerFlops",
-    "sb3_sparse.analysis.NetworkSNR",
-    "sb3_sparse.analysis.NoiseRobustness",
-    "sb3_sparse.analysis.PlasticityCallback",
+WITHOUT_EXAMPLE: set[str] = {
     "sb3_sparse.compress.Compression",
     "sb3_sparse.export.ExportReport",
     "sb3_sparse.export.Parity",

@@ -18,7 +18,7 @@ from sb3_sparse.fused.inputs import TYPES
 from sb3_sparse.fused.machine import Machine
 from sb3_sparse.fused.program import Program
 from sb3_sparse.fused.values import Value
-from sb3_sparse.policies.shortcut import takes_vectors
+from sb3_sparse.policies.fast_forward import takes_vectors
 
 IN_PLACE, SAMPLED, N_STEP = "in place", "sampled", "n-step"
 """Ways to read a replay buffer: its arrays in place, or batches from its own ``sample``."""

@@ -21,8 +21,8 @@ from sb3_sparse.fused.machine import Machine
 from sb3_sparse.fused.optimizers import KNOWN, Known, rmsprop
 from sb3_sparse.fused.program import Program
 from sb3_sparse.fused.values import Value
+from sb3_sparse.policies.fast_forward import takes_vectors
 from sb3_sparse.policies.internals import samples
-from sb3_sparse.policies.shortcut import takes_vectors
 
 METHODS: Methods = {
     "": ("evaluate_actions", "extract_features", "_get_action_dist_from_latent"),

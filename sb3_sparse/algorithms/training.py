@@ -28,9 +28,9 @@ from sb3_sparse.fused.machine import Machine
 from sb3_sparse.fused.program import Parts, Program
 from sb3_sparse.policies.base import BaseSparsePolicy
 from sb3_sparse.policies.compiled import unwrapped
+from sb3_sparse.policies.fast_forward import only_flattens, overrides, takes_vectors
 from sb3_sparse.policies.registry import registered, writers_of
-from sb3_sparse.policies.shortcut import only_flattens, takes_vectors, untouched
-from sb3_sparse.policies.storage import KNOWN
+from sb3_sparse.policies.storage import KNOWN_PACKAGES
 
 SEEN = attrgetter("requires_grad", "_backward_hooks", "_post_accumulate_grad_hooks")
 KNOWN_MODULES = (nn.Linear, SparseLinear, nn.Identity, *ACTIVATIONS)
@@ -161,10 +161,10 @@ def _check_policy(policy: BaseSparsePolicy, methods: Methods) -> None:
         if patched(module):
             raise NotCovered(f"{name or 'the policy'} has methods of its own")
         distribution: Any = type(getattr(module, "action_dist", None))
-        if distribution.__module__.partition(".")[0] not in (*KNOWN, "builtins"):
+        if distribution.__module__.partition(".")[0] not in (*KNOWN_PACKAGES, "builtins"):
             raise NotCovered(f"the distribution {distribution.__name__}")
     for name, called in methods.items():
-        if not untouched(policy.get_submodule(name), called):
+        if overrides(policy.get_submodule(name), called):
             raise NotCovered(f"{name or 'the policy'} has methods of its own")
     for module in policy.modules():
         if isinstance(module, BaseFeaturesExtractor) and not only_flattens(module):

@@ -1,4 +1,4 @@
-"""What sparse and dense agents are like: cost, gradients, robustness to noise, plasticity."""
+"""Measures sparse and dense agents: cost, gradients, robustness to noise, plasticity."""
 
 from sb3_sparse.analysis.activity import (
     DormantShare,
@@ -7,6 +7,7 @@ from sb3_sparse.analysis.activity import (
     effective_ranks,
 )
 from sb3_sparse.analysis.flops import FlopsReport, LayerFlops, flops
+from sb3_sparse.analysis.losses import Loss, register_losses
 from sb3_sparse.analysis.plasticity import PlasticityCallback
 from sb3_sparse.analysis.robustness import (
     NoiseRobustness,
@@ -22,6 +23,7 @@ __all__ = [
     "GradientSNR",
     "GradientSNRCallback",
     "LayerFlops",
+    "Loss",
     "NetworkSNR",
     "NoiseRobustness",
     "PlasticityCallback",
@@ -33,4 +35,5 @@ __all__ = [
     "gradient_snr",
     "noise_robustness",
     "noisy_vec_env",
+    "register_losses",
 ]

@@ -1,4 +1,4 @@
-"""What the units of networks do: dormant ones, and the rank of the last features."""
+"""Dormant units, and the effective rank of the last features."""
 
 from __future__ import annotations
 
@@ -20,15 +20,24 @@ from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.policies.spec import output_layers
 
 CHUNK = 128
-"""Observations that are run at once."""
+"""Observations in one forward pass."""
 
 
 @dataclass(frozen=True)
 class DormantShare:
-    """Dormant fraction of the units.
+    """Fractions of dormant units.
 
-    :param networks: of each network that has activation functions
-    :param overall: of all units of these
+    Example::
+
+        from sb3_sparse import DQN
+        from sb3_sparse.analysis import dormant_share
+
+        model = DQN("SparsePolicy", "CartPole-v1", policy_kwargs=dict(sparsity=0.9))
+        observations = model.get_env().reset()
+        print(dormant_share(model, observations).networks["q_net"])
+
+    :param networks: fraction in each network that has activation functions
+    :param overall: fraction in all of these together
     """
 
     networks: dict[str, float]
@@ -37,17 +46,17 @@ class DormantShare:
 
 @dataclass
 class Activity:
-    """What one network's units did on some observations.
+    """Activations of one network on some observations.
 
     :param activations: mean absolute activation of every unit, by layer
-    :param features: what enters each output layer, shape ``(observations, dim)``
+    :param features: inputs of each output layer, shape ``(observations, dim)``
     """
 
     activations: list[NDArray[np.float64]] = field(default_factory=list)
     features: list[NDArray[np.float64]] = field(default_factory=list)
 
     def dormant(self, tau: float) -> NDArray[np.bool_]:
-        """Which units are ``tau``-dormant, of all layers together."""
+        """Whether each unit is ``tau``-dormant, for all layers together."""
         found = [units <= tau * units.mean() for units in self.activations]
         return np.concatenate(found)
 
@@ -57,14 +66,14 @@ def dormant_share(
 ) -> DormantShare:
     """Share of units that are ``tau``-dormant: mean ``|activation| / layer's mean <= tau``.
 
-    A layer is the output of a module of ``torch.nn.modules.activation``, a unit one of its features
-    (of images a channel). In a layer that is silent as a whole all units are dormant.
+    A layer is the output of a module of ``torch.nn.modules.activation``, and a unit is one of its
+    features (a channel, for images). If all activations of a layer are 0, its units are dormant.
 
-    :param model: an SB3 model or its policy, sparse or stock; nothing of it changes
+    :param model: an SB3 model or its policy, sparse or stock; it does not change
     :param observations: a batch, as the policy's ``predict`` takes it, or tensors of a buffer
-    :param tau: 0 or more
+    :param tau: threshold, 0 or more
     :param actions: for critics of actions, scaled to [-1, 1], shape ``(observations, dim)``; None:
-        the actor's deterministic ones
+        the actor's deterministic actions
     :raises ConfigError: if no network has such a module, or for a tau below 0
 
     Source: Sokar et al. 2023 (arXiv:2302.12902), definition 3.1.
@@ -75,19 +84,19 @@ def dormant_share(
 
 
 def dormant_of(found: dict[str, Activity], tau: float) -> DormantShare:
-    """As :func:`dormant_share`, of activity that was looked at already."""
+    """As :func:`dormant_share`, for activations that are known already."""
     dormant = {name: one.dormant(tau) for name, one in found.items() if one.activations}
     if not dormant:
         raise ConfigError(
             f"none of the networks {', '.join(found)} has an activation function that is a module, "
-            "so it has no units that could be dormant"
+            "so there are no units that could be dormant"
         )
     overall = np.concatenate(list(dormant.values())).mean()
     return DormantShare({name: float(d.mean()) for name, d in dormant.items()}, float(overall))
 
 
 def effective_rank(features: Any, delta: float = 0.01) -> int:
-    """Least number of singular values that sum up to ``1 - delta`` of all of them; of zeros 0.
+    """Least number of singular values that make up ``1 - delta`` of their sum; 0 if it is 0.
 
     :param features: shape ``(n, dim)``
     :param delta: in [0, 1)
@@ -111,21 +120,22 @@ def effective_rank(features: Any, delta: float = 0.01) -> int:
 def effective_ranks(
     model: BaseAlgorithm | BasePolicy, observations: Any, delta: float = 0.01, actions: Any = None
 ) -> dict[str, float]:
-    """:func:`effective_rank` of what enters each network's output layer.
+    """:func:`effective_rank` of the inputs of each network's output layer.
 
-    Of several heads on features of their own (twin critics) it is the mean. It can be no more than
-    the number of observations.
+    For several heads with features of their own, such as twin critics, it is the mean. It cannot
+    exceed the number of observations.
 
-    :param model: an SB3 model or its policy; nothing of it changes
-    :param observations: as of :func:`dormant_share`
+    :param model: an SB3 model or its policy; it does not change
+    :param observations: as for :func:`dormant_share`
     :param delta: in [0, 1)
-    :param actions: as of :func:`dormant_share`
+    :param actions: as for :func:`dormant_share`
+    :return: rank by network
     """
     return ranks_of(activity(model, observations, actions), delta)
 
 
 def ranks_of(found: dict[str, Activity], delta: float) -> dict[str, float]:
-    """As :func:`effective_ranks`, of activity that was looked at already."""
+    """As :func:`effective_ranks`, for activations that are known already."""
     return {
         name: float(np.mean([effective_rank(features, delta) for features in one.features]))
         for name, one in found.items()
@@ -135,7 +145,7 @@ def ranks_of(found: dict[str, Activity], delta: float) -> dict[str, float]:
 def activity(
     model: BaseAlgorithm | BasePolicy, observations: Any, actions: Any = None
 ) -> dict[str, Activity]:
-    """Run every network on observations; what several networks share counts for the first.
+    """Run every network on observations; shared layers count for the first network.
 
     :raises ConfigError: without observations, or if actions do not fit them
     """
@@ -198,7 +208,7 @@ def _run(policy: Any, network: str, observations: Any, actions: Any) -> None:
 
 
 class _Watched:
-    """Hooks that sum up a twin's activations; those of the twin's other passes are dropped.
+    """Hooks that sum up a twin's activations during the passes of one network.
 
     :param activations: activation functions
     :param heads: output layers
@@ -221,7 +231,7 @@ class _Watched:
             self.inputs.append(inputs[0])
 
     def end_part(self) -> None:
-        """Add what a chunk of observations showed."""
+        """Add the sums of one chunk of observations."""
         if not self.sums:
             self.sums = [th.zeros_like(part) for part in self.part]
         self.sums = [a + b for a, b in zip(self.sums, self.part, strict=True)]
@@ -229,7 +239,7 @@ class _Watched:
         self.part, self.inputs = [], []
 
     def remove(self, count: int) -> Activity:
-        """Take the hooks off."""
+        """Remove the hooks, and return the means over observations."""
         for handle in self.handles:
             handle.remove()
         features = [th.cat(parts).numpy() for parts in zip(*self.features, strict=True)]

@@ -1,4 +1,4 @@
-"""Minibatches to measure on, drawn without a trace in what training draws."""
+"""Minibatches to measure on, drawn without changing what training draws."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from sb3_sparse.errors import ConfigError
 
 @contextmanager
 def own_randomness(seed: int, device: th.device) -> Iterator[None]:
-    """Seed the global generators of NumPy and torch for a while; they are put back afterwards.
+    """Seed the global generators of NumPy and torch, and restore their states afterwards.
 
     :param seed: 0 or more
-    :param device: whose generator is put back too
+    :param device: its generator is restored too
     """
     before = np.random.get_state()
     with th.random.fork_rng([device] if device.type == "cuda" else []):
@@ -33,7 +33,7 @@ def own_randomness(seed: int, device: th.device) -> Iterator[None]:
 
 
 def has_batch(model: BaseAlgorithm) -> bool:
-    """Whether there is anything in the replay buffer, or a rollout is complete."""
+    """Whether the replay buffer has transitions, or a rollout is complete."""
     replay, rollout = _buffers(model)
     return (replay is not None and replay.size() > 0) or (rollout is not None and rollout.full)
 
@@ -41,11 +41,11 @@ def has_batch(model: BaseAlgorithm) -> bool:
 def sample_batch(model: BaseAlgorithm, batch_size: int | None = None, seed: int = 0) -> Any:
     """A minibatch as the algorithm's ``train()`` draws one: from its replay or rollout buffer.
 
-    :param model: an SB3 model that has such a buffer, with something in it
+    :param model: an SB3 model whose buffer is not empty
     :param batch_size: samples; None: as many as the algorithm takes
-    :param seed: of the draw
+    :param seed: seed of the draw
     :return: SB3's named tuple
-    :raises ConfigError: without a buffer, or if there is nothing in it
+    :raises ConfigError: if there is no buffer, or it is empty
     """
     replay, rollout = _buffers(model)
     if not has_batch(model):

@@ -17,7 +17,7 @@ from sb3_sparse.errors import ConfigError
 from sb3_sparse.policies.base import BaseSparsePolicy
 from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.policies.registry import registered
-from sb3_sparse.policies.report import LayerReport, SparsityReport, report_on
+from sb3_sparse.policies.report import LayerReport, SparsityReport, build_report, table_lines
 from sb3_sparse.policies.spec import PassCounts
 from sb3_sparse.sparsity.numeric import is_whole
 
@@ -26,13 +26,22 @@ from sb3_sparse.sparsity.numeric import is_whole
 class LayerFlops:
     """FLOPs of one layer.
 
-    :param network: name of the network that it belongs to
+    Example::
+
+        from sb3_sparse import DQN
+        from sb3_sparse.analysis import flops
+
+        model = DQN("SparsePolicy", "CartPole-v1", policy_kwargs=dict(sparsity=0.9))
+        first = flops(model).layers[0]
+        print(first.name, first.forward, first.dense_forward)
+
+    :param network: name of the network that the layer belongs to
     :param name: dotted name within the policy
     :param shape: weight shape, torch order
     :param nnz: active connections
-    :param forward: of a forward pass at batch 1
+    :param forward: FLOPs of a forward pass at batch 1
     :param dense_forward: the same for the dense layer
-    :param step: of a gradient step, with the whole minibatch; None: only a policy was given
+    :param step: FLOPs of a gradient step with the whole minibatch; None: only a policy was given
     :param dense_step: the same for the dense layer
     """
 
@@ -50,9 +59,18 @@ class LayerFlops:
 class FlopsReport:
     """FLOPs of all layers; ``print`` it for a table.
 
-    :param layers: every layer once, targets not apart
-    :param algorithm: whose gradient step was counted; None: none was
-    :param batch_size: samples of its minibatch
+    Example::
+
+        from sb3_sparse import SAC
+        from sb3_sparse.analysis import flops
+
+        model = SAC("SparsePolicy", "Pendulum-v1", policy_kwargs=dict(sparsity=0.9))
+        report = flops(model)
+        print(report.forward("actor") / report.dense_forward("actor"), report.step())
+
+    :param layers: every layer once; the steps of target networks are in those of their originals
+    :param algorithm: name of the algorithm whose gradient step was counted; None: none was
+    :param batch_size: size of its minibatch
     :param passes: how often it runs each network
     """
 
@@ -67,22 +85,22 @@ class FlopsReport:
         return tuple(dict.fromkeys(layer.network for layer in self.layers))
 
     def forward(self, network: str | None = None) -> int:
-        """Of one forward pass at batch 1, of one network or of all."""
+        """FLOPs of one forward pass at batch 1, of one network or of all."""
         return sum(layer.forward for layer in self._of(network))
 
     def dense_forward(self, network: str | None = None) -> int:
-        """The same without sparsity."""
+        """As :meth:`forward`, without sparsity."""
         return sum(layer.dense_forward for layer in self._of(network))
 
     def step(self, network: str | None = None) -> float:
-        """Of one gradient step, of one network or of all.
+        """FLOPs of one gradient step, of one network or of all.
 
         :raises ConfigError: if only a policy was given, which has no gradient steps
         """
         return sum(self._counted(layer.step) for layer in self._of(network))
 
     def dense_step(self, network: str | None = None) -> float:
-        """The same without sparsity.
+        """As :meth:`step`, without sparsity.
 
         :raises ConfigError: if only a policy was given
         """
@@ -115,18 +133,10 @@ class FlopsReport:
             steps = [(r.step or 0.0, r.dense_step or 0.0) for r in self.layers]
             steps += [(self.step(name), self.dense_step(name)) for name in ends]
             rows = [row + _share(*step) for row, step in zip(rows, steps, strict=True)]
-        widths = [max(map(len, column)) for column in zip(heads, *rows, strict=True)]
-        lines = [
-            "  ".join(
-                cell.ljust(width) if i < 2 else cell.rjust(width)
-                for i, (cell, width) in enumerate(zip(row, widths, strict=True))
-            )
-            for row in (heads, *rows)
-        ]
         note = "FLOPs, forward at batch 1"
         if self.algorithm is not None:
             note += f"; gradient step of {self.algorithm} at batch {self.batch_size}"
-        return "\n".join([*lines, note])
+        return "\n".join([*table_lines([heads, *rows]), note])
 
 
 def _share(flops: float, dense: float) -> list[str]:
@@ -138,24 +148,23 @@ def flops(
 ) -> FlopsReport:
     """Count the FLOPs of any SB3 policy, and of a gradient step if a model is given.
 
-    A multiply-add counts 2; biases and activations 1 each. What is sparse is counted by its active
-    connections for each output position, as if zeros cost nothing.
+    A multiply-add counts 2, a bias and an activation 1 each. Sparse layers count their active
+    connections, for each output position, as if zeros cost nothing.
 
-    A gradient step counts, for each sample of the minibatch: 1 for a forward pass; 2 for a backward
-    pass of what is trained; target networks forward only; 1 for handing a gradient on to the actor
-    through a critic (stock SB3 computes the critic's weight gradients there too and throws them
-    away, which is not counted). How often each network runs is declared where the algorithm is
-    registered; delays and minibatch are the model's. Optimizers, averaging
-    of targets, normalisation layers, losses and RigL's dense gradients are not counted.
+    For each sample of the minibatch, a gradient step counts 1 for a forward pass, also of a target
+    network, 2 for a backward pass of a network that is trained, and 1 for the gradient that the
+    actor gets through a critic. (There, stock SB3 computes the critic's own gradients too and
+    throws them away, which does not count.) How often each network runs is declared where the
+    algorithm is registered. Optimizers, averaging of targets, normalisation layers, losses and
+    RigL's dense gradients do not count.
 
     :param policy_or_model: sparse or stock, with any features extractor of Linear and Conv layers
-    :param batch_size: samples of a gradient step; None: the model's
+    :param batch_size: size of the minibatch; None: the model's
     :raises UnsupportedError: for a policy whose networks are not known
-    :raises ConfigError: for a model whose algorithm's steps are not known, or a batch size without
+    :raises ConfigError: for a model whose algorithm's passes are not known, or a batch size without
         a model
 
-    Source: arXiv:2206.10369; a step of three forward passes where all is trained as in
-    arXiv:1911.11134.
+    Source: arXiv:2206.10369; a gradient step counts as three forward passes as in arXiv:1911.11134.
     """
     policy_or_model = unwrapped(policy_or_model)
     if isinstance(policy_or_model, BasePolicy):
@@ -191,7 +200,7 @@ def passes_of(model: BaseAlgorithm) -> list[PassCounts]:
 
 
 def batch_size_of(model: Any) -> int:
-    """Samples of the model's minibatch."""
+    """Size of the model's minibatch."""
     if hasattr(model, "batch_size"):
         return int(model.batch_size)
     return int(model.n_steps * model.n_envs)  # A2C takes the whole rollout
@@ -204,17 +213,17 @@ def _layer(r: LayerReport, times: float | None) -> LayerFlops:
 
 
 def _report(policy: BasePolicy) -> SparsityReport:
-    """The sparsity report; of a stock policy that of a policy with all of its layers left dense."""
+    """The sparsity report; all layers of a stock policy count as left dense."""
     if isinstance(policy, BaseSparsePolicy):
         return policy.sparsity_report()
     owned = _owned(policy)
-    return report_on(
+    return build_report(
         policy, [SparseNetwork(name, policy, [], list(owned[name].items())) for name in owned]
     )
 
 
 def _owned(policy: BasePolicy) -> dict[str, dict[str, Any]]:
-    """Layers by network; one that several run belongs to the first."""
+    """Layers by network; a shared layer belongs to the first."""
     seen: set[int] = set()
     found: dict[str, dict[str, Any]] = {}
     for network, spec in specs_of(policy).items():
@@ -225,7 +234,7 @@ def _owned(policy: BasePolicy) -> dict[str, dict[str, Any]]:
 
 
 def _times(policy: BasePolicy, passes: list[PassCounts]) -> dict[str, float]:
-    """Forward passes that a layer's work in one gradient step amounts to, for each sample."""
+    """The work of each layer in one gradient step, in forward passes of one sample."""
     specs, owned = specs_of(policy), _owned(policy)
     names = {id(m): name for layers in owned.values() for name, m in layers.items()}
     times = dict.fromkeys(names.values(), 0.0)

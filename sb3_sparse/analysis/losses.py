@@ -1,4 +1,4 @@
-"""The losses of algorithms, for one sample at a time."""
+"""The losses of algorithms, computed one sample at a time."""
 
 from __future__ import annotations
 
@@ -26,9 +26,20 @@ MakeLosses = Callable[[Any, Any, Any], "list[Loss]"]
 class Loss:
     """One loss that an algorithm minimises; its mean over the minibatch is the algorithm's own.
 
-    :param networks: what it trains
-    :param samples: tensors (or dicts of them) whose first dimension is the sample
-    :param of_sample: the loss of one sample, from a policy and the sample without that dimension
+    Example::
+
+        from sb3_sparse.analysis import Loss
+
+        def squared_error(policy, sample):
+            return (policy.q_net(sample["observations"][None]) - sample["target"]).square().mean()
+
+        def losses(model, policy, batch):  # for register_losses
+            samples = dict(observations=batch.observations, target=batch.rewards)
+            return [Loss(("q_net",), samples, squared_error)]
+
+    :param networks: names of the networks that it trains
+    :param samples: tensors, or dicts of tensors, whose first dimension is the sample
+    :param of_sample: computes the loss of a policy for one sample, without that dimension
     """
 
     networks: tuple[str, ...]
@@ -40,11 +51,11 @@ _losses: dict[type[Any], MakeLosses] = {}
 
 
 def register_losses(algorithm: type[BaseAlgorithm]) -> Callable[[MakeLosses], MakeLosses]:
-    """Decorator of the function that makes an algorithm's losses, for :func:`gradient_snr`.
+    """Decorator of a function that makes an algorithm's losses, for ``gradient_snr``.
 
-    The function is given a model, a twin of its policy and a minibatch.
+    It takes a model, a twin of its policy with dense weights, and a minibatch.
 
-    :param algorithm: the class that defines ``train()``
+    :param algorithm: class that defines ``train()``, or inherits it
     """
 
     def register(losses: MakeLosses) -> MakeLosses:
@@ -163,7 +174,7 @@ def _ppo(model: Any, policy: Any, batch: Any) -> list[Loss]:
 
 
 def losses_for(algorithm: type[BaseAlgorithm]) -> MakeLosses:
-    """What makes an algorithm's losses, from the model, a twin of its policy and a minibatch.
+    """The function that :func:`register_losses` was given for an algorithm.
 
     :raises ConfigError: for an algorithm whose ``train()`` is none of the known ones
     """

@@ -1,4 +1,4 @@
-"""Which connections have been active so far."""
+"""Records which connections have been active so far."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from sb3_sparse.loading.arrays import read_arrays
 from sb3_sparse.loading.guard import reading
 
 NEVER = 2**32 - 1
-"""Time at which a connection that never was active became so."""
+"""Time of the first activity of a connection that has never been active."""
 
 
 class MaskHistory:
-    """Looks at masks now and then, and remembers when each connection was first seen active.
+    """Looks at masks from time to time, and records when each connection was first active.
 
-    With a path it is saved after each look. A model that goes on from an earlier time forgets what
-    was seen after that; then churn is counted from the masks it goes on with.
+    With a path it is saved after each look. Where a model resumes from an earlier time, later looks
+    are dropped, and churn counts from the model's masks.
 
     :param networks: the policy's sparse networks
-    :param timesteps: environment steps at which it begins
-    :param path: ``.npz`` file; None: it is kept in memory only, and begins anew with each training
+    :param timesteps: environment steps at the start
+    :param path: ``.npz`` file; None: the record stays in memory and starts anew with each training
     """
 
     def __init__(
@@ -40,7 +40,7 @@ class MaskHistory:
             self._load(path, timesteps)
             return
         if path is not None and timesteps:
-            warn(f"{path} is not there, so exploration rates count from step {timesteps} on")
+            warn(f"there is no file {path}, so exploration rates count from step {timesteps} on")
         for layer in self._layers():
             self.first[layer.name] = np.full(layer.size, NEVER, np.uint32)
         self._see(timesteps)
@@ -85,7 +85,7 @@ class MaskHistory:
         sizes = {f"first/{layer.name}": layer.size for layer in self._layers()}
         found = {name: array.size for name, array in saved.items() if name.startswith("first/")}
         if found != sizes:
-            raise CorruptStateError(f"{path} is of a policy with other layers; {cure}")
+            raise CorruptStateError(f"{path} belongs to a policy with other layers; {cure}")
         with reading(path, what, cure):
             ahead = int(saved["timesteps"]) > timesteps
             for layer in self._layers():

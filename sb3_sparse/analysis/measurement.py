@@ -1,4 +1,4 @@
-"""What the callbacks that measure have in common: when to measure, and a CSV file that resumes."""
+"""The base class of measuring callbacks: when to measure, and a CSV file that resumes."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ HEADS = ("timesteps", "name", "value")
 
 
 class MeasurementFile:
-    """Rows ``timesteps,name,value``.
+    """A CSV file with rows ``timesteps,name,value``.
 
-    :param path: of the CSV file; folders are made
+    :param path: of the file; its folder is created
     """
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
 
     def begin(self, timesteps: int) -> None:
-        """Drop what is later than the model; a model at 0 begins an empty file.
+        """Drop rows that are later than the model; a model at step 0 starts an empty file.
 
         :param timesteps: environment steps that the model has seen
-        :raises CorruptStateError: for a file of another form
+        :raises CorruptStateError: if the file has another form
         """
         rows = self._rows() if timesteps and self.path.exists() else []
         self.path.parent.mkdir(parents=True, exist_ok=True)
@@ -46,7 +46,7 @@ class MeasurementFile:
             head, *rows = list(csv.reader(whole.splitlines())) or [list(HEADS)]
         if tuple(head) != HEADS or any(len(r) != 3 or not r[0].isdigit() for r in rows):
             raise CorruptStateError(
-                f"{self.path} is no file of measurements with columns {', '.join(HEADS)}; give "
+                f"{self.path} is not a file of measurements with columns {', '.join(HEADS)}; give "
                 "another path, or remove it"
             )
         return rows
@@ -59,16 +59,16 @@ class MeasurementFile:
 
 
 class MeasurementCallback(BaseCallback):
-    """Measures every so many environment steps, into SB3's logger and a file.
+    """Measures every few environment steps, and writes to SB3's logger and a file.
 
-    Off-policy algorithms are measured after an environment step, once learning has started;
-    on-policy ones at the end of the rollout in which a measurement fell due.
+    Off-policy algorithms are measured after an environment step, once learning has started, and
+    on-policy algorithms at the end of the rollout in which a measurement was due.
 
     :param every: environment steps between two measurements
-    :param path: CSV file with rows ``timesteps,name,value``; None: only SB3's logger. A model that
-        has learnt before goes on in it, and what is later there than the model is dropped
+    :param path: CSV file with rows ``timesteps,name,value``; None: only SB3's logger. A
+        resumed model continues it, and rows later than the model are dropped
     :param verbose: as in SB3
-    :raises ConfigError: if ``every`` is no positive integer
+    :raises ConfigError: if ``every`` is not a positive integer
     """
 
     def __init__(self, every: int, path: str | Path | None = None, verbose: int = 0) -> None:
@@ -80,9 +80,9 @@ class MeasurementCallback(BaseCallback):
 
     @abstractmethod
     def measure(self, seed: int) -> Mapping[str, float]:
-        """Values by name, without a trace in the model.
+        """Values by name, measured without changing the model.
 
-        :param seed: for what is drawn; the same at the same environment step of the same run
+        :param seed: seed of random draws; the same at the same environment step of the same run
         """
 
     def _on_training_start(self) -> None:

@@ -17,13 +17,13 @@ from sb3_sparse.engine.prunable import PRUNABLE_TYPES, UNSUPPORTED_TYPES, Prunab
 from sb3_sparse.errors import UnsupportedError
 from sb3_sparse.policies.base import BaseSparsePolicy
 from sb3_sparse.policies.compiled import unwrapped
-from sb3_sparse.policies.parts import WHOLE_POLICY, without_graphs
+from sb3_sparse.policies.modules import WHOLE_POLICY, memo_without_graphs
 from sb3_sparse.policies.registry import sparse_counterpart, supported_algorithms
-from sb3_sparse.policies.spec import NetworkSpec
+from sb3_sparse.policies.spec import NetworkSpec, in_target
 
 
 def specs_of(policy: BasePolicy) -> Mapping[str, NetworkSpec]:
-    """Where a policy keeps its networks; a stock policy's are those of its sparse counterpart.
+    """Where a policy keeps its networks, as its sparse counterpart declares.
 
     :raises UnsupportedError: for a policy without a counterpart, or with layers elsewhere
     """
@@ -41,18 +41,17 @@ def specs_of(policy: BasePolicy) -> Mapping[str, NetworkSpec]:
 
 def _check_complete(policy: BasePolicy, specs: Mapping[str, NetworkSpec]) -> None:
     known = {id(module) for name in specs for module in prunable_of(policy, specs[name]).values()}
-    targets = tuple(f"{spec.target}." for spec in specs.values() if spec.target is not None)
     for name, module in policy.named_modules():
         other = isinstance(module, PRUNABLE_TYPES) and id(module) not in known
-        if isinstance(module, UNSUPPORTED_TYPES) or (other and not name.startswith(targets)):
+        if isinstance(module, UNSUPPORTED_TYPES) or (other and not in_target(name, specs)):
             raise UnsupportedError(
-                f"{name}, a {type(module).__name__} of {type(policy).__name__}, is no Linear or "
+                f"{name}, a {type(module).__name__} of {type(policy).__name__}, is not a Linear or "
                 f"Conv layer of the networks {', '.join(map(repr, specs))}"
             )
 
 
 def modules_of(policy: nn.Module, spec: NetworkSpec) -> dict[str, nn.Module]:
-    """Every module that a network runs once, shared ones too, by dotted name."""
+    """Every module of a network once, also shared ones, by dotted name."""
     named = dict(policy.named_modules(remove_duplicate=False))
     found: dict[int, tuple[str, nn.Module]] = {}
     for root in spec.roots:
@@ -63,15 +62,15 @@ def modules_of(policy: nn.Module, spec: NetworkSpec) -> dict[str, nn.Module]:
 
 
 def prunable_of(policy: nn.Module, spec: NetworkSpec) -> dict[str, Prunable]:
-    """Every Linear and Conv layer that a network runs, shared ones too, by dotted name."""
+    """Every Linear and Conv layer of a network, also shared ones, by dotted name."""
     modules = modules_of(policy, spec)
     return {name: module for name, module in modules.items() if isinstance(module, PRUNABLE_TYPES)}
 
 
 def parameters_by_network(policy: BasePolicy) -> dict[str, list[str]]:
-    """Names of the parameters that are trained; what several networks share is the first's.
+    """Names of the trained parameters; shared ones belong to the first network.
 
-    What lies in no network (the ``log_std`` of PPO) is the first's too.
+    So do parameters outside all networks, such as the ``log_std`` of PPO.
     """
     policy = unwrapped(policy)
     specs = specs_of(policy)
@@ -80,13 +79,12 @@ def parameters_by_network(policy: BasePolicy) -> dict[str, list[str]]:
     for network, spec in specs.items():
         parameters = [p for m in modules_of(policy, spec).values() for p in m.parameters(False)]
         found[network] = [names.pop(id(p)) for p in parameters if id(p) in names]
-    targets = tuple(f"{spec.target}." for spec in specs.values() if spec.target is not None)
-    found[next(iter(specs))] += [name for name in names.values() if not name.startswith(targets)]
+    found[next(iter(specs))] += [name for name in names.values() if not in_target(name, specs)]
     return found
 
 
 def connections(policy: BasePolicy) -> dict[str, NDArray[Any] | None]:
-    """The mask of every weight, flat, by its parameter's name; None where all are active."""
+    """The mask of every weight, flat, by the parameter's name; None: all are active."""
     policy = unwrapped(policy)
     names = {id(p): name for name, p in policy.named_parameters()}
     found: dict[str, NDArray[Any] | None] = {}
@@ -100,17 +98,17 @@ def connections(policy: BasePolicy) -> dict[str, NDArray[Any] | None]:
 
 
 class _LeftOut:
-    """Stands in a twin for what it does without."""
+    """Stands in a twin for an optimizer or a controller."""
 
 
 def dense_twin(policy: BasePolicy) -> BasePolicy:
-    """A copy to compute with, whatever becomes of it: frozen, in evaluation mode.
+    """A copy of a policy to compute with: frozen, in evaluation mode, without optimizers.
 
-    It has no optimizers. Every layer has its dense weight, 0 where inactive, under the same
-    parameter name, so that gradients at inactive connections can be taken.
+    Every layer has a dense weight, 0 where inactive, under the same parameter name, so that
+    gradients at inactive connections can be taken.
     """
     policy = unwrapped(policy)
-    memo: dict[Any, Any] = {**without_graphs(policy), WHOLE_POLICY: True}
+    memo: dict[Any, Any] = {**memo_without_graphs(policy), WHOLE_POLICY: True}
     for module in policy.modules():
         for value in vars(module).values():
             if isinstance(value, (th.optim.Optimizer, Controller)):

@@ -1,4 +1,4 @@
-"""Whether networks can still learn, and how much of them has been tried."""
+"""The callback that measures plasticity: dormant units, ranks, and moves of masks."""
 
 from __future__ import annotations
 
@@ -16,26 +16,35 @@ from sb3_sparse.policies.compiled import unwrapped
 
 
 class PlasticityCallback(MeasurementCallback):
-    """Logs dormant units, effective ranks and, of sparse policies, how their masks have moved.
+    """Logs dormant units, effective ranks and, for sparse policies, how masks have moved.
 
-    Logged: ``plasticity/dormant`` (of all units), ``plasticity/dormant/<network>``,
-    ``plasticity/effective_rank/<network>``, ``plasticity/mask_churn/<network>`` (fraction of the
-    connections, active or not, that have changed between active and inactive since the last look)
-    and ``plasticity/exploration/<network>`` (fraction of the connections that have been active at a
-    look so far, the one at the start included: the in-time over-parameterisation rate). A network
-    without activation functions has no dormant share.
+    Logged: ``plasticity/dormant`` (share of all units), ``plasticity/dormant/<network>``,
+    ``plasticity/effective_rank/<network>``, ``plasticity/mask_churn/<network>`` (fraction of all
+    connections that have changed between active and inactive since the last measurement) and
+    ``plasticity/exploration/<network>`` (fraction of all connections that have been active at a
+    measurement so far, or at the start: the in-time over-parameterisation rate). A network without
+    activation functions has no dormant share.
 
-    Nothing of the training changes. Which connections have been active is saved beside ``path``, as
-    ``<stem>.masks.npz``, and a resumed run that passes the same callback again goes on with it;
-    without ``path`` it counts since this training began. Choose ``every`` at most the interval of
-    mask updates, or connections that come and go between two looks are missed.
+    The training does not change. Which connections have been active is saved beside ``path`` as
+    ``<stem>.masks.npz``, from where a resumed run with the same callback continues; without
+    ``path`` it counts from the start of this training. Let ``every`` be at most the interval of
+    mask updates, or connections that come and go between two measurements are missed.
 
-    :param every: environment steps between two looks
+    Example::
+
+        from sb3_sparse import DQN
+        from sb3_sparse.analysis import PlasticityCallback
+
+        kwargs = dict(sparsity=0.9, net_arch=[16])
+        model = DQN("SparsePolicy", "CartPole-v1", learning_starts=10, policy_kwargs=kwargs)
+        model.learn(40, callback=PlasticityCallback(every=20, path="plasticity.csv"))
+
+    :param every: environment steps between two measurements
     :param path: CSV file, see :class:`~sb3_sparse.analysis.measurement.MeasurementCallback`
-    :param batch_size: observations, drawn from the replay buffer or the last rollout; an effective
-        rank can be no larger
+    :param batch_size: observations, drawn from the replay buffer or the last rollout; no effective
+        rank exceeds it
     :param tau: threshold of dormancy
-    :param delta: of the effective rank
+    :param delta: threshold of the effective rank
     :param verbose: as in SB3
     :raises ConfigError: for a value that is not allowed
     :raises UnsupportedError: for a policy whose networks are not known

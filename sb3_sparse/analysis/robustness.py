@@ -1,4 +1,4 @@
-"""Return of a trained policy under noise on what it observes."""
+"""Returns of a trained policy under noise on its observations."""
 
 from __future__ import annotations
 
@@ -35,7 +35,14 @@ Wrap = Callable[[gym.Env[Any, Any]], gym.Env[Any, Any]]
 class NoiseRobustness:
     """Returns under noise.
 
-    :param returns: of the episodes, in the environment's own reward, by sigma and seed
+    Example::
+
+        from sb3_sparse.analysis import NoiseRobustness
+
+        table = NoiseRobustness({(0.0, 0): (500.0, 480.0), (0.5, 0): (120.0, 90.0)})
+        assert table.means() == {0.0: 490.0, 0.5: 105.0}
+
+    :param returns: returns of the episodes, in the environment's own reward, by sigma and seed
     """
 
     returns: Mapping[tuple[float, int], tuple[float, ...]]
@@ -67,18 +74,18 @@ def noise_robustness(
 ) -> NoiseRobustness:
     """Evaluate a policy at several strengths of noise.
 
-    Each environment plays its share of the episodes to the end, so that short ones are not
-    preferred, and the return is the Monitor's, before rewards are clipped or normalised. The same
-    seed gives the same episodes for every model. Nothing of the model changes, nor the global
-    generators of NumPy and torch.
+    Each environment plays its share of the episodes to the end, so that short episodes are not
+    preferred. Returns are the Monitor's, before rewards are clipped or normalised. The same seed
+    gives the same episodes for every model. The model does not change, nor do the global generators
+    of NumPy and torch.
 
     :param model: trained model
-    :param make_envs: environments with noise of a sigma; they are closed here
-    :param sigmas: strengths; the default is that of images, in grey levels. Of vectors the unit is
+    :param make_envs: makes environments with noise of a sigma; they are closed afterwards
+    :param sigmas: strengths; the default is for images, in grey levels. For vectors the unit is
         each feature's standard deviation: take e.g. 0, 0.1, ..., 1
     :param n_episodes: episodes for each sigma and seed
     :param seeds: seeds of environments, noise and (if it is random) policy
-    :param deterministic: whether the policy takes its likeliest action
+    :param deterministic: whether the policy takes its most likely action
     :raises ConfigError: for values that are not allowed, and for environments without a Monitor or
         whose VecNormalize still learns
 
@@ -91,7 +98,7 @@ def noise_robustness(
         )
     for name, values in {"sigmas": sigmas, "seeds": seeds}.items():
         if len(set(values)) < len(values):
-            raise ConfigError(f"one of the {name} stands twice in {list(values)}")
+            raise ConfigError(f"one of the {name} is given twice in {list(values)}")
     returns: dict[tuple[float, int], tuple[float, ...]] = {}
     for sigma in sigmas:
         envs = make_envs(sigma)
@@ -113,20 +120,20 @@ def noise_robustness(
 def _check(envs: VecEnv) -> None:
     if not is_vecenv_wrapped(envs, VecMonitor) and not all(envs.env_is_wrapped(Monitor)):
         raise ConfigError(
-            "noise_robustness takes returns from SB3's Monitor, which these environments lack; "
+            "noise_robustness needs SB3's Monitor, which these environments lack; "
             "make them with make_vec_env or noisy_vec_env"
         )
     normalize = unwrap_vec_normalize(envs)
     if normalize is not None and normalize.training:
         raise ConfigError(
-            "the VecNormalize of these environments still learns, from noise; set its training to "
-            "False"
+            "the VecNormalize of these environments still updates its statistics, from noise; set "
+            "its training to False"
         )
 
 
 @contextmanager
 def _seeded(model: BaseAlgorithm, seed: int) -> Iterator[None]:
-    """Make a random policy's actions depend on the seed; DQN's come from its action space."""
+    """Let the actions of a random policy depend on the seed; DQN draws from its action space."""
     space = model.action_space
     before = space.np_random.bit_generator.state
     with own_randomness(seed, model.device):
@@ -149,33 +156,33 @@ def noisy_vec_env(
     normalize: str | None = None,
     env_kwargs: dict[str, Any] | None = None,
 ) -> VecEnv:
-    """Environments with noise on what they show.
+    """Environments with noise on their observations.
 
-    Images get ``round(N(0, sigma))`` in every pixel of every frame, before it is stacked and
-    normalised, saturating at 0 and 255; reset frames too. Vectors get ``N(0, sigma * std)``.
+    Images get ``round(N(0, sigma))`` in every pixel of every frame, also after a reset, before
+    stacking and normalisation, saturating at 0 and 255. Vectors get ``N(0, sigma * std)``.
 
-    :param env_id: as of SB3's ``make_vec_env``
-    :param sigma: images: grey levels, 0 to 30 in the paper; vectors: in units of each feature's
-        standard deviation, so that 1 is noise as large as the signal
-    :param n_envs: environments
-    :param seed: seed of the first
-    :param std: of each feature, which only vectors have: see :func:`feature_std`
-    :param wrapper: below the noise, e.g. SB3's ``AtariWrapper``
+    :param env_id: as in SB3's ``make_vec_env``
+    :param sigma: for images in grey levels, 0 to 30 in the paper; for vectors in units of each
+        feature's standard deviation, so that 1 is noise as large as the signal
+    :param n_envs: number of environments
+    :param seed: seed of the first environment
+    :param std: standard deviation of each feature, for vectors only: see :func:`feature_std`
+    :param wrapper: applied below the noise, e.g. SB3's ``AtariWrapper``
     :param frame_stack: frames to stack; 0: none
     :param normalize: saved ``VecNormalize``, put above the noise and frozen
-    :param env_kwargs: for the environment
-    :raises ConfigError: for observations that are neither, vectors without std, images with one
+    :param env_kwargs: arguments of the environment
+    :raises ConfigError: for other observations, vectors without ``std`` or images with it
     """
 
     def noisy(env: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
         env = env if wrapper is None else wrapper(env)
         if env.observation_space.dtype == np.uint8:
             if std is not None:
-                raise ConfigError("std is of vectors; noise on images is in grey levels")
+                raise ConfigError("std is for vectors; noise on images is in grey levels")
             return PixelNoise(env, sigma)
         if std is None:
             raise ConfigError(
-                "noise on vectors goes by the std of each feature; give std=feature_std(model, "
+                "noise on vectors is in units of each feature's std; give std=feature_std(model, "
                 "envs) with environments without noise"
             )
         return ObservationNoise(env, sigma, std)
@@ -194,12 +201,12 @@ def feature_std(
 ) -> NDArray[np.float64]:
     """Standard deviation of each feature while a policy acts, before normalisation.
 
-    :param model: takes its likeliest actions
-    :param envs: without noise; a ``VecNormalize`` must be frozen
+    :param model: takes its most likely actions
+    :param envs: environments without noise; a ``VecNormalize`` must be frozen
     :param steps: environment steps of all environments together
-    :param seed: of the environments
+    :param seed: seed of the environments
     :return: shape of an observation
-    :raises ConfigError: for observations that are no vectors or images, or too few steps
+    :raises ConfigError: for observations other than vectors and images, or too few steps
     """
     if steps < 2 * envs.num_envs:
         raise ConfigError(f"{steps} steps are too few for {envs.num_envs} environments")
@@ -207,7 +214,9 @@ def feature_std(
         raise ConfigError(f"feature_std takes vectors, got {envs.observation_space}")
     normalize = unwrap_vec_normalize(envs)
     if normalize is not None and normalize.training:
-        raise ConfigError("the VecNormalize of these environments still learns; set training=False")
+        raise ConfigError(
+            "the VecNormalize of these environments still updates; set training=False"
+        )
     envs.seed(seed)
     observation = envs.reset()
     seen = []

@@ -27,12 +27,22 @@ CHUNK_NUMBERS = 2**23
 
 @dataclass(frozen=True)
 class NetworkSNR:
-    """Of one network.
+    """Signal-to-noise ratio of the gradients of one network.
 
-    :param network: its name
-    :param all: mean over all of its parameters: active and inactive connections, biases, log_std
-    :param active: mean over its active connections
-    :param inactive: mean over its inactive connections; None: it has none
+    Example::
+
+        from sb3_sparse import DQN
+        from sb3_sparse.analysis import gradient_snr
+
+        kwargs = dict(sparsity=0.9, net_arch=[16])
+        model = DQN("SparsePolicy", "CartPole-v1", learning_starts=10, policy_kwargs=kwargs)
+        snr = gradient_snr(model.learn(40), batch_size=8)["q_net"]
+        print(snr.all, snr.active, snr.inactive)
+
+    :param network: name of the network
+    :param all: mean over all parameters: active and inactive connections, biases, log_std
+    :param active: mean over active connections
+    :param inactive: mean over inactive connections; None: there are none
     """
 
     network: str
@@ -43,10 +53,20 @@ class NetworkSNR:
 
 @dataclass(frozen=True)
 class GradientSNR:
-    """Of all networks of a model.
+    """Signal-to-noise ratios of the gradients of all networks of a model.
 
-    :param networks: one for each
-    :param samples: samples in the minibatch
+    Example::
+
+        from sb3_sparse import PPO
+        from sb3_sparse.analysis import gradient_snr
+
+        kwargs = dict(sparsity=0.9, net_arch=[16])
+        kwargs = dict(n_steps=32, batch_size=16, policy_kwargs=kwargs)
+        model = PPO("SparsePolicy", "CartPole-v1", **kwargs)
+        print(gradient_snr(model.learn(32), batch_size=8).values())
+
+    :param networks: the ratios of each network
+    :param samples: size of the minibatch
     """
 
     networks: tuple[NetworkSNR, ...]
@@ -56,7 +76,7 @@ class GradientSNR:
         return {one.network: one for one in self.networks}[network]
 
     def values(self) -> dict[str, float]:
-        """By the names under which they are logged."""
+        """All ratios, by the names under which they are logged."""
         found: dict[str, float] = {}
         for one in self.networks:
             name = f"snr/{one.network}"
@@ -70,7 +90,7 @@ class GradientSNR:
         return f"{rows}\n(over {self.samples} samples)"
 
 
-class Moments:
+class RunningStatistics:
     """Mean and standard deviation over samples that arrive in chunks, in float64.
 
     Source: Chan, Golub and LeVeque 1983, *Algorithms for computing the sample variance*.
@@ -83,7 +103,7 @@ class Moments:
         """Sum of squared distances from the mean."""
 
     def add(self, values: th.Tensor) -> None:
-        """Take samples along the first dimension."""
+        """Add samples, along the first dimension."""
         values, n = values.to(th.float64), len(values)
         mean = values.mean(dim=0)
         apart = mean - self.mean.to(mean.device)
@@ -100,7 +120,7 @@ class Moments:
 
 
 class _OfSample(nn.Module):
-    """A loss as a module, as ``functional_call`` wants it."""
+    """A loss as a module, as ``functional_call`` needs it."""
 
     def __init__(self, policy: nn.Module, loss: Loss) -> None:
         super().__init__()
@@ -114,13 +134,13 @@ class _OfSample(nn.Module):
 def per_sample_gradients(
     twin: nn.Module, loss: Loss, names: list[str], chunk: int | None = None
 ) -> Iterator[dict[str, th.Tensor]]:
-    """Gradients of each sample's own loss, a chunk of samples at a time.
+    """Gradients of the loss of each sample, a chunk of samples at a time.
 
     :param twin: policy with dense weights
     :param loss: loss and samples
-    :param names: parameters to take gradients of
+    :param names: names of the parameters
     :param chunk: samples at a time; None: as many as fit into a few dozen MB
-    :return: by name, shape ``(samples, *shape of the dense parameter)``
+    :return: gradients by name, shape ``(samples, *shape of the dense parameter)``
     """
     parameters = dict(twin.named_parameters())
     wanted = {f"policy.{name}": parameters[name].detach() for name in names}
@@ -151,22 +171,23 @@ def gradient_snr(
 ) -> GradientSNR:
     """Signal-to-noise ratio of the gradients of single samples of one minibatch.
 
-    For each parameter ``|mean| / (std + 1e-10)`` over the samples' gradients of the algorithm's own
-    loss (population std), then the mean over parameters. At inactive connections it is the dense
-    gradient, of the loss by a weight that is 0. Advantages of PPO are normalised over the minibatch
-    as in SB3, targets of DQN and SAC come from the target networks, actions of SAC are drawn anew.
-    Before clipping, without weight decay. Batch normalisation and dropout are in evaluation mode,
-    because single samples have no batch statistics.
+    The ratio of a parameter is ``|mean| / (std + 1e-10)`` over the gradients of the algorithm's own
+    loss for each sample (population std); a network's is the mean over its parameters. Inactive
+    connections take part with their dense gradient. As in SB3, advantages of PPO are normalised
+    over the minibatch, targets of DQN and SAC come from the target networks, and actions of SAC are
+    drawn anew. Gradients are taken before clipping and without weight decay. Batch normalisation
+    and dropout are in evaluation mode, because single samples have no batch statistics.
 
-    Nothing of the model changes, nor the global generators of NumPy and torch.
+    The model does not change, nor do the global generators of NumPy and torch.
 
-    :param model: DQN, SAC or PPO, with sparse or stock policy
+    :param model: a model of DQN, SAC, PPO or an algorithm with
+        :func:`~sb3_sparse.analysis.losses.register_losses`, its policy sparse or stock
     :param batch: SB3's named tuple of a replay or rollout buffer; None: one is drawn as ``train()``
         does, from the replay buffer or the last rollout
     :param batch_size: samples to draw; None: as many as the algorithm takes
-    :param seed: of what is drawn
-    :param chunk: samples whose gradients are in memory at once; None: chosen by their size
-    :raises ConfigError: for another algorithm, or a model that has nothing to draw from
+    :param seed: seed of random draws
+    :param chunk: samples whose gradients are in memory at once; None: depends on their size
+    :raises ConfigError: for another algorithm, or a model whose buffers are empty
 
     Source: arXiv:2206.10369, section on the signal-to-noise ratio.
     """
@@ -186,12 +207,12 @@ def gradient_snr(
             made = losses(model, twin, batch)
         for loss in made:
             trained = [name for network in loss.networks for name in names[network]]
-            moments = {name: Moments() for name in trained}
+            statistics = {name: RunningStatistics() for name in trained}
             for gradients in per_sample_gradients(twin, loss, trained, chunk):
                 for name, each in gradients.items():
-                    moments[name].add(each)
+                    statistics[name].add(each)
             for network in loss.networks:
-                snr = {name: moments[name].snr.flatten().cpu() for name in names[network]}
+                snr = {name: statistics[name].snr.flatten().cpu() for name in names[network]}
                 results[network] = _means(network, snr, masks)
     in_order = tuple(results[name] for name in names)
     return GradientSNR(in_order, len(pytree.tree_leaves(batch._asdict())[0]))
@@ -216,10 +237,19 @@ def _means(network: str, snr: Mapping[str, th.Tensor], masks: Mapping[str, Any])
 
 
 class GradientSNRCallback(MeasurementCallback):
-    """Logs :func:`gradient_snr` while a model trains, and changes nothing of the training.
+    """Logs :func:`gradient_snr` while a model trains, without changing the training.
 
     Logged: ``snr/<network>``, ``snr/<network>/active`` and, where there are inactive connections,
-    ``snr/<network>/inactive``. Has no state: a resumed run passes the same callback again.
+    ``snr/<network>/inactive``. To resume a training, pass the same callback again.
+
+    Example::
+
+        from sb3_sparse import DQN
+        from sb3_sparse.analysis import GradientSNRCallback
+
+        kwargs = dict(sparsity=0.9, net_arch=[16])
+        model = DQN("SparsePolicy", "CartPole-v1", learning_starts=10, policy_kwargs=kwargs)
+        model.learn(40, callback=GradientSNRCallback(every=20, batch_size=8, path="snr.csv"))
 
     :param every: environment steps between two measurements; DQN and SAC are measured once learning
         has started, PPO at the end of a rollout, before it trains on it

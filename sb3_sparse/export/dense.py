@@ -16,11 +16,11 @@ from stable_baselines3.common.save_util import is_json_serializable
 
 from sb3_sparse.errors import UnsupportedError
 from sb3_sparse.export.pathless import pickled
+from sb3_sparse.policies.arguments import import_classes
 from sb3_sparse.policies.base import BaseSparsePolicy
 from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.policies.config import SparsityConfig
 from sb3_sparse.policies.internals import LAST_SEEN
-from sb3_sparse.policies.named import import_named
 from sb3_sparse.policies.saving import parts_of
 
 STOCK = ("stable_baselines3.", "sb3_contrib.")
@@ -77,7 +77,7 @@ def _stock_kwargs(policy: BasePolicy, kwargs: dict[str, Any]) -> dict[str, Any]:
     """Policy arguments without those of sparse policies, the classes among them imported."""
     sparse = SparsityConfig.__dataclass_fields__
     stock = {name: value for name, value in kwargs.items() if name not in sparse}
-    import_named(stock)
+    import_classes(stock)
     if isinstance(policy, BaseSparsePolicy):  # which may have another by default
         stock["features_extractor_class"] = policy.features_extractor_class
     return stock

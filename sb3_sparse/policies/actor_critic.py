@@ -10,14 +10,13 @@ import torch as th
 from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.distributions import DiagGaussianDistribution, Distribution
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, NatureCNN
 
 from sb3_sparse.errors import UnsupportedError
-from sb3_sparse.policies.acting import Actions
 from sb3_sparse.policies.base import BaseSparsePolicy
-from sb3_sparse.policies.registry import register_policy, with_extractor
-from sb3_sparse.policies.sampling import QuickCategorical, QuickGaussian, quick
-from sb3_sparse.policies.shortcut import Shortcut, untouched
+from sb3_sparse.policies.fast_distributions import FastCategorical, FastGaussian, fast_distribution
+from sb3_sparse.policies.fast_forward import FastForward, overrides
+from sb3_sparse.policies.fast_predict import Actions
+from sb3_sparse.policies.registry import register_policy, variants_of
 from sb3_sparse.policies.spec import NetworkSpec, PassCounts
 
 ACTOR = ("mlp_extractor.policy_net", "action_net")
@@ -25,7 +24,7 @@ CRITIC = ("mlp_extractor.value_net", "value_net")
 
 
 class NoSuchPart(UnsupportedError, AttributeError):
-    """Another algorithm's policy has the attribute, and a sparse one has not."""
+    """A sparse policy lacks an attribute that an unsupported algorithm asks for."""
 
 
 def on_policy_passes(model: Any) -> list[PassCounts]:
@@ -36,7 +35,15 @@ def on_policy_passes(model: Any) -> list[PassCounts]:
 @register_policy(PPO, passes=on_policy_passes, told_by="clip_range")
 @register_policy(A2C, passes=on_policy_passes)
 class SparseActorCriticPolicy(BaseSparsePolicy, ActorCriticPolicy):
-    """Sparse actor and value network for PPO, A2C and TRPO; a shared extractor is the actor's."""
+    """Sparse actor and value network for PPO, A2C and TRPO; a shared extractor is the actor's.
+
+    Example::
+
+        from sb3_sparse import PPO, SparseActorCriticPolicy
+
+        kwargs = dict(sparsity=0.9, distribution="uniform")
+        model = PPO(SparseActorCriticPolicy, "CartPole-v1", policy_kwargs=kwargs)
+    """
 
     acting = ("pi_features_extractor", *ACTOR)
     networks = {
@@ -51,27 +58,30 @@ class SparseActorCriticPolicy(BaseSparsePolicy, ActorCriticPolicy):
             heads=("value_net",),
         ),
     }
-    functional_gradients = True  # TRPO's actor; SB3 does not say which algorithm builds the policy
-    _shortcuts: Mapping[str, Shortcut] = {}
+    functional_gradients = True  # of TRPO; a policy is not told which algorithm makes it
+    _fast_forward: Mapping[str, FastForward] = {}
 
     def use_kernels(self) -> None:
         if self.use_sde:
-            return  # its distribution asks for the actor's features too
-        self.action_dist = quick(self.action_dist)
+            return  # its distribution needs the features of the actor too
+        self.action_dist = fast_distribution(self.action_dist)
         acts = ("_get_action_dist_from_latent",)
-        self._shortcuts = {"actor": Shortcut((ACTOR,), acts), "critic": Shortcut((CRITIC,))}
+        self._fast_forward = {
+            "actor": FastForward((ACTOR,), acts),
+            "critic": FastForward((CRITIC,)),
+        }
         if self.share_features_extractor:
-            self._shortcuts["both"] = Shortcut((ACTOR, CRITIC), acts)
+            self._fast_forward["both"] = FastForward((ACTOR, CRITIC), acts)
 
     def _results(self, networks: str, obs: Any, extractor: str) -> list[th.Tensor] | None:
-        shortcut = self._shortcuts.get(networks)
+        shortcut = self._fast_forward.get(networks)
         return None if shortcut is None else shortcut.results(self, obs, extractor)
 
     def forward(
         self, obs: Any, deterministic: bool = False
     ) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
         """As in SB3: actions, values of shape ``(n, 1)`` and log probabilities ``(n,)``."""
-        results = self._actor_and_critic(obs) if self._shortcuts else None
+        results = self._actor_and_critic(obs) if self._fast_forward else None
         acted = None if results is None else self._act(results[0], deterministic)
         if results is None or acted is None:
             return super().forward(obs, deterministic)
@@ -79,7 +89,7 @@ class SparseActorCriticPolicy(BaseSparsePolicy, ActorCriticPolicy):
         return actions.view(-1, *self.action_space.shape), results[1], log_prob  # type: ignore[misc]
 
     def _actor_and_critic(self, obs: Any) -> list[th.Tensor] | None:
-        """What the actor's head and the critic give; None where modules must be called."""
+        """Outputs of actor and critic; None: the modules have to be called."""
         if self.share_features_extractor:
             return self._results("both", obs, "features_extractor")
         mean = self._results("actor", obs, "pi_features_extractor")
@@ -103,20 +113,20 @@ class SparseActorCriticPolicy(BaseSparsePolicy, ActorCriticPolicy):
         results = self._results("critic", obs, "vf_features_extractor")
         return super().predict_values(obs) if results is None else results[0]
 
-    def _choose(self, observations: Actions, deterministic: bool) -> Actions | None:
-        if not self._shortcuts or not untouched(self, ("get_distribution",)):
+    def _fast_actions(self, observations: Actions, deterministic: bool) -> Actions | None:
+        if not self._fast_forward or overrides(self, ("get_distribution",)):
             return None
-        results = self._shortcuts["actor"].of_array(self, observations)
+        results = self._fast_forward["actor"].from_numpy(self, observations)
         if results is None:
             return None
         acted = self._act(th.from_numpy(results[0]), deterministic)
         return None if acted is None else acted[0].numpy()
 
     def _act(self, result: th.Tensor, deterministic: bool) -> tuple[th.Tensor, th.Tensor] | None:
-        """Actions and log probabilities of what the actor's head gives."""
-        if isinstance(self.action_dist, QuickGaussian):
+        """Actions and log probabilities, from the output of the actor."""
+        if isinstance(self.action_dist, FastGaussian):
             return self.action_dist.act(result, self.log_std, deterministic)
-        if isinstance(self.action_dist, QuickCategorical):
+        if isinstance(self.action_dist, FastCategorical):
             return self.action_dist.act(result, deterministic)
         distribution = self._distribution(result)
         actions = distribution.get_actions(deterministic)
@@ -124,10 +134,10 @@ class SparseActorCriticPolicy(BaseSparsePolicy, ActorCriticPolicy):
 
     def __getattr__(self, name: str) -> Any:
         try:
-            return self.__dict__["_modules"][name]  # before torch looks in other places
+            return self.__dict__["_modules"][name]  # the most frequent case
         except KeyError:
             pass
-        if name == "lstm_actor":  # what RecurrentPPO asks for first, before it checks the class
+        if name == "lstm_actor":  # RecurrentPPO reads it before it checks the class
             raise NoSuchPart(
                 "RecurrentPPO has no sparse policy, since an LSTM cannot be masked; PPO, A2C and "
                 "TRPO have one"
@@ -140,8 +150,6 @@ class SparseActorCriticPolicy(BaseSparsePolicy, ActorCriticPolicy):
         return {"action_net": 0.01, "value_net": 1.0}.get(layer_name, math.sqrt(2))
 
 
-SparseActorCriticMlpPolicy = with_extractor(SparseActorCriticPolicy, "Mlp", FlattenExtractor)
-SparseActorCriticCnnPolicy = with_extractor(SparseActorCriticPolicy, "Cnn", NatureCNN)
-SparseActorCriticMultiInputPolicy = with_extractor(
-    SparseActorCriticPolicy, "MultiInput", CombinedExtractor
+SparseActorCriticMlpPolicy, SparseActorCriticCnnPolicy, SparseActorCriticMultiInputPolicy = (
+    variants_of(SparseActorCriticPolicy)
 )

@@ -1,4 +1,4 @@
-"""What makes an SB3 policy sparse; the policy files only say where."""
+"""The base class of all sparse policies."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from sb3_sparse.engine.linear import check_conversion
 from sb3_sparse.engine.optimizers import check_weight_decay, prefer_fused
 from sb3_sparse.engine.places import check_places
 from sb3_sparse.errors import CorruptStateError, UnsupportedError
-from sb3_sparse.policies.acting import Acts
+from sb3_sparse.policies.arguments import check_arguments, import_classes
 from sb3_sparse.policies.build import build_networks
 from sb3_sparse.policies.compiled import names_in, plain_names
-from sb3_sparse.policies.config import SparsityConfig, check_arguments
+from sb3_sparse.policies.config import SparsityConfig
 from sb3_sparse.policies.extractors import choose_extractor, copied_modules
-from sb3_sparse.policies.named import import_named
-from sb3_sparse.policies.parts import WHOLE_POLICY, without_graphs
+from sb3_sparse.policies.fast_predict import FastPredict
+from sb3_sparse.policies.modules import WHOLE_POLICY, memo_without_graphs
 from sb3_sparse.policies.randomness import peek_seed
-from sb3_sparse.policies.report import SparsityReport, report_on
+from sb3_sparse.policies.report import SparsityReport, build_report
 from sb3_sparse.policies.spec import NetworkSpec
 from sb3_sparse.policies.storage import may_be_sparse
 from sb3_sparse.policies.vectors import from_vector, to_vector
@@ -35,14 +35,24 @@ from sb3_sparse.policies.vectors import from_vector, to_vector
 Sparse = TypeVar("Sparse", bound="BaseSparsePolicy")
 
 
-class BaseSparsePolicy(Acts):
-    """Sparse networks inside an SB3 policy. SB3's own arguments keep their meaning.
+class BaseSparsePolicy(FastPredict):
+    """Base class of sparse policies, to be put before a policy class of SB3.
+
+    A subclass declares where its networks are; this class makes them sparse and keeps them so.
+
+    Example::
+
+        from sb3_sparse import SAC, BaseSparsePolicy
+
+        model = SAC("SparsePolicy", "Pendulum-v1", policy_kwargs=dict(sparsity=0.9))
+        assert isinstance(model.policy, BaseSparsePolicy)
+        print(model.policy.sparsity_report())
 
     :param observation_space: as in SB3
     :param action_space: as in SB3
     :param lr_schedule: as in SB3
     :param kwargs: fields of :class:`~sb3_sparse.policies.config.SparsityConfig`, of which
-        ``sparsity`` is required, and SB3's own policy arguments; ``features_extractor_class``,
+        ``sparsity`` is required, and SB3's policy arguments; ``features_extractor_class``,
         ``optimizer_class`` and ``activation_fn`` may also be dotted paths, e.g.
         ``"torch.nn.ReLU"``
     :raises ConfigError: for a value that is not allowed
@@ -53,24 +63,24 @@ class BaseSparsePolicy(Acts):
     """
 
     networks: ClassVar[Mapping[str, NetworkSpec]]
-    """Name of each network and where its modules are."""
+    """Where the modules of each network are, by the network's name."""
     acting: ClassVar[tuple[str, ...]]
-    """Modules that an observation passes through to become an action: a features extractor, then
+    """Names of the modules that turn an observation into an action: the features extractor, then
     those of the network."""
     acting_quantiles: ClassVar[str] = ""
-    """Attribute with the number of quantiles that the network has for each action; it acts by their
-    mean."""
+    """Attribute with the number of quantiles for each action, of whose mean the policy takes the
+    best; empty: it has none."""
     action_spaces: ClassVar[tuple[type[spaces.Space[Any]], ...]] = (
         spaces.Box,
         spaces.Discrete,
         spaces.MultiDiscrete,
         spaces.MultiBinary,
     )
-    """Action spaces that the policy can act in."""
+    """Kinds of action space that the policy supports."""
     functional_gradients: ClassVar[bool] = False
-    """Whether an algorithm of this policy takes gradients with ``torch.autograd.grad``."""
+    """Whether an algorithm with this policy calls ``torch.autograd.grad``."""
     extractor_class: ClassVar[type[BaseFeaturesExtractor] | None] = None
-    """Features extractor by default; None chooses by the observation space."""
+    """Default features extractor; None: it depends on the observation space."""
 
     def __init__(
         self,
@@ -81,13 +91,13 @@ class BaseSparsePolicy(Acts):
     ) -> None:
         if lr_schedule is None:
             raise UnsupportedError(
-                f"{type(self).__name__} got no learning-rate schedule: it cannot serve an "
-                "algorithm that learns without gradients, such as ARS, which has no sparse policy. "
+                f"{type(self).__name__} got no learning-rate schedule. Algorithms that learn "
+                "without gradients, such as ARS, have no sparse policy; "
                 "sb3_sparse.supported_algorithms() lists those that have one"
             )
         check_arguments(type(self), kwargs)
         config = SparsityConfig.pop_from(kwargs)
-        import_named(kwargs)
+        import_classes(kwargs)
         weight_decay = check_weight_decay(config.weight_decay, kwargs.get("optimizer_kwargs"))
         if "features_extractor_class" not in kwargs:
             kwargs["features_extractor_class"] = self.extractor_class or choose_extractor(
@@ -113,11 +123,11 @@ class BaseSparsePolicy(Acts):
         if config.compute == "sparse":
             self.sparse.to_sparse(self, allowed)
         if not all(layer.full and layer.final_nnz == layer.size for layer in self.sparse.layers):
-            self.use_kernels()  # a policy without zeros stays stock SB3's to the bit
+            self.use_kernels()  # without zeros it computes what stock SB3 does, to the bit
         self.sparse.attach()
 
     def __deepcopy__(self: Sparse, memo: dict[int, Any]) -> Sparse:
-        memo.update(without_graphs(self))
+        memo.update(memo_without_graphs(self))
         memo[WHOLE_POLICY] = True  # type: ignore[index]
         twin = type(self).__new__(type(self))
         memo[id(self)] = twin
@@ -126,23 +136,24 @@ class BaseSparsePolicy(Acts):
         return twin
 
     def _apply(self, fn: Any, recurse: bool = True) -> Any:
-        sparse = vars(self).get("sparse")  # SB3 moves parts before the whole is there
+        sparse = vars(self).get("sparse")  # SB3 moves modules before the policy is complete
         if sparse is not None and any(layer.is_sparse for layer in sparse.layers):
             try:
-                check_conversion(fn)  # before anything has changed
+                check_conversion(fn)  # before anything changes
             except UnsupportedError:
                 if self.sparsity_config.compute != "auto":
                     raise
-                sparse.to_masked(self)  # to a GPU, say
+                sparse.to_masked(self)  # to move to a GPU, for instance
         return super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)  # type: ignore[no-untyped-call]
-        self.sparse.attach()  # a copy's hooks do not come along
+        self.sparse.attach()  # hooks are not copied
 
     def make_features_extractor(self) -> BaseFeaturesExtractor:
-        """As in SB3, with copies of modules in ``features_extractor_kwargs``: each extractor has
-        its own, and what the user handed in stays as it was.
+        """As in SB3, with copies of the modules in ``features_extractor_kwargs``.
+
+        So each extractor has its own, and the user's modules stay as they were.
         """
         given = self.features_extractor_kwargs
         self.features_extractor_kwargs = copied_modules(given)
@@ -152,7 +163,7 @@ class BaseSparsePolicy(Acts):
             self.features_extractor_kwargs = given
 
     def use_kernels(self) -> None:
-        """Replace what SB3 computes in more steps than it needs."""
+        """Compute in the kernels from now on, where they can."""
 
     def _initial_gain(self, layer_name: str) -> float:
         """Gain with which SB3 initialises the layer, relative to its default."""
@@ -165,15 +176,15 @@ class BaseSparsePolicy(Acts):
         """
         check_places(self, self.sparse.layers)
         self.sparse.enforce()
-        return report_on(self, self.sparse.networks)
+        return build_report(self, self.sparse.networks)
 
     def set_training_mode(self, mode: bool) -> None:
-        """As in SB3. Every ``train()`` calls it first: here a copied policy gets its hooks back."""
+        """As in SB3. Every ``train()`` calls it first, so a round of training begins here."""
         self._switch(mode)
         if mode:
             self.sparse.begin_training(self)
         else:
-            self.sparse.notice()  # before anybody acts with what others have written
+            self.sparse.notice()  # users may have written to weights
 
     def _switch(self, mode: bool) -> bool:
         same = super()._switch(mode)
@@ -186,7 +197,7 @@ class BaseSparsePolicy(Acts):
         return to_vector(self)
 
     def load_from_vector(self, vector: np.ndarray[Any, Any]) -> None:
-        """As in SB3; what the masks have inactive stays 0, and a warning says so.
+        """As in SB3; inactive connections stay 0, and a warning counts the values dropped.
 
         :raises ConfigError: if the vector has another length
         """
@@ -197,7 +208,7 @@ class BaseSparsePolicy(Acts):
     def load_state_dict(
         self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False
     ) -> Any:
-        """As in torch; weights without masks (of a dense policy) are masked, targets too."""
+        """As in torch; the weights of a dense policy, and of its target networks, are masked."""
         state_dict = plain_names(state_dict)
         self._check_masks(state_dict)
         named = names_in(self, state_dict)
@@ -205,7 +216,7 @@ class BaseSparsePolicy(Acts):
         if not any(key.endswith(".weight_mask") for key in state_dict):
             for layer in self.sparse.layers:
                 layer.mask_targets()
-        self.sparse.choose_storage(self)  # of a policy that was pruned
+        self.sparse.choose_storage(self)  # pruning may have made layers sparse
         return incompatible
 
     def _check_masks(self, state_dict: Mapping[str, Any]) -> None:
@@ -216,9 +227,9 @@ class BaseSparsePolicy(Acts):
                 layer.check_mask(mask)
 
     def get_extra_state(self) -> th.Tensor:
-        """Mask seed, clock and number of mask updates of each network, and a 0; int64.
+        """Mask seed, then clock and number of mask updates of each network, then a 0; int64.
 
-        Older files may have a minibatch size in place of the 0, which no longer means anything.
+        Older files have a minibatch size in place of the 0, which is ignored.
         """
         numbers = [self.sparse.seed]
         for network in self.sparse.networks:
@@ -227,9 +238,9 @@ class BaseSparsePolicy(Acts):
         return th.tensor(numbers, dtype=th.int64)
 
     def set_extra_state(self, state: th.Tensor) -> None:
-        """Take back what :meth:`get_extra_state` gave.
+        """Restore what :meth:`get_extra_state` returned.
 
-        :raises CorruptStateError: if it is not of this policy
+        :raises CorruptStateError: if it does not belong to this policy
         """
         networks = self.sparse.networks
         expected = 2 + 2 * len(networks)

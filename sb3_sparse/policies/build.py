@@ -1,4 +1,4 @@
-"""From a finished SB3 policy to its sparse networks."""
+"""Builds the sparse networks of a finished SB3 policy."""
 
 from __future__ import annotations
 
@@ -18,11 +18,12 @@ from sb3_sparse.policies.spec import (
     DENSE_WORDS,
     NetworkLayers,
     NetworkSpec,
+    in_target,
     input_layers,
     matches,
     output_layers,
 )
-from sb3_sparse.policies.storage import KNOWN
+from sb3_sparse.policies.storage import is_known
 
 
 def build_networks(
@@ -32,11 +33,11 @@ def build_networks(
     seed: int,
     gain: Callable[[str], float],
 ) -> list[SparseNetwork]:
-    """Find the layers, draw masks and weights, and bring the targets in line.
+    """Find the layers, draw masks and weights, and copy both to the target networks.
 
-    :param policy: a policy whose constructor has run to its end
-    :param specs: its networks
-    :param config: how sparse they shall be
+    :param policy: a policy whose SB3 constructor has finished
+    :param specs: where it keeps its networks
+    :param config: the sparse arguments
     :param seed: mask seed
     :param gain: SB3's initial gain of a layer, by its name
     :raises ConfigError: if the configuration does not fit the policy
@@ -80,17 +81,16 @@ def build_networks(
 def _warn_of_redrawn(
     policy: BasePolicy, modules: Mapping[str, nn.Module], networks: Iterable[SparseNetwork]
 ) -> None:
-    """Say so if weights that a user's extractor came with, pretrained perhaps, are about to go.
+    """Warn if the weights of a user's own extractor, perhaps pretrained, are about to be lost.
 
-    Where SB3 has just drawn them itself (``ortho_init``), there is nothing left of them to lose.
+    With ``ortho_init`` SB3 has drawn them anew already.
     """
     if getattr(policy, "ortho_init", False):
         return
     own = [
         f"{name}."
         for name, module in modules.items()
-        if isinstance(module, BaseFeaturesExtractor)
-        and type(module).__module__.partition(".")[0] not in KNOWN
+        if isinstance(module, BaseFeaturesExtractor) and not is_known(type(module))
     ]
     lost = [
         layer.name
@@ -100,9 +100,9 @@ def _warn_of_redrawn(
     ]
     if lost:
         warn(
-            f"the weights of {', '.join(lost)} are drawn anew, by the connections that are there, "
-            "though they are not as torch draws them. To keep weights of your own, pretrained ones "
-            "for instance, masked, give policy_kwargs=dict(sparsity_aware_init=False)"
+            f"the weights of {', '.join(lost)} are drawn anew for their connections, though they "
+            "do not look as torch initialises them. To keep your own weights, for instance "
+            "pretrained ones, and mask them, give policy_kwargs=dict(sparsity_aware_init=False)"
         )
 
 
@@ -118,7 +118,7 @@ def _find_layers(
     specs: Mapping[str, NetworkSpec],
     config: SparsityConfig,
 ) -> dict[str, NetworkLayers]:
-    """The layers of each network; one that several reach belongs to the first."""
+    """The layers of each network; a layer that several networks contain belongs to the first."""
     patterns = config.dense_layers
     seen: set[int] = set()
     found = {name: NetworkLayers() for name in specs}
@@ -149,17 +149,17 @@ def _find_layers(
     if unmatched:
         names = [name for layers in found.values() for name, _ in layers.sparse + layers.dense]
         raise ConfigError(
-            f"dense_layers has {', '.join(map(repr, sorted(unmatched)))}, which is no layer of "
-            f"this policy; its layers are {', '.join(names)}, or use the words 'input' and 'output'"
+            f"dense_layers has {', '.join(map(repr, sorted(unmatched)))}, which matches no layer "
+            f"of this policy; its layers are {', '.join(names)}, or use the words 'input' and "
+            "'output'"
         )
     return found
 
 
 def _check_complete(policy: nn.Module, specs: Mapping[str, NetworkSpec], seen: set[int]) -> None:
-    """Reject trained layers that belong to no network, which would stay dense unnoticed."""
-    targets = tuple(f"{spec.target}." for spec in specs.values() if spec.target is not None)
+    """Reject trained layers that belong to no network and would silently stay dense."""
     for name, module in find_prunable(policy, "", lambda _: True):
-        trained = module.weight.requires_grad and not name.startswith(targets)
+        trained = module.weight.requires_grad and not in_target(name, specs)
         if trained and id(module.weight) not in seen:
             raise UnsupportedError(
                 f"{name} belongs to none of the networks {', '.join(map(repr, specs))} of "
@@ -173,7 +173,7 @@ def _add_targets(
     specs: Mapping[str, NetworkSpec],
     networks: Iterable[SparseNetwork],
 ) -> None:
-    """Give every layer its copies in the target networks, which have the same names there."""
+    """Tell every layer its copy in the target network, which has the same name there."""
     layers = {id(layer.weight): layer for network in networks for layer in network.layers}
     done: set[int] = set()
     for spec in specs.values():

@@ -16,8 +16,8 @@ Value = TypeVar("Value")
 def unwrapped(policy: Policy) -> Policy:
     """The policy itself, where ``torch.compile`` has wrapped it.
 
-    ``torch.compile`` returns a module of a class of its own, ``OptimizedModule``, that passes
-    attributes on to the policy. Whoever asks for the class of a policy asks for that of this.
+    ``torch.compile`` returns an ``OptimizedModule``, which passes attributes on to the policy but
+    is not of its class.
 
     :param policy: compiled or not; parameters and hooks are the same in both
     """
@@ -26,14 +26,14 @@ def unwrapped(policy: Policy) -> Policy:
 
 
 def plain_names(state: Mapping[str, Value]) -> dict[str, Value]:
-    """A state_dict under the names that it has without ``torch.compile``."""
+    """A state_dict with the names that it has without ``torch.compile``."""
     return {_plain(name): value for name, value in state.items()}
 
 
 def names_in(module: nn.Module, state: Mapping[str, Value]) -> dict[str, Value]:
-    """A state_dict under a module's own names, whichever parts of it are compiled.
+    """A state_dict with a module's own names, whichever of its modules are compiled.
 
-    :param state: under plain names
+    :param state: with plain names
     """
     if not any(name.endswith(WRAPPED) for name, _ in module.named_modules()):
         return dict(state)

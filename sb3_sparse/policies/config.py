@@ -1,17 +1,15 @@
-"""The sparse arguments of a policy, checked when made."""
+"""The sparse arguments of a policy."""
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from functools import cache
 from typing import Any
 
 import numpy as np
 
 from sb3_sparse.engine.native.library import library
-from sb3_sparse.errors import ConfigError, did_you_mean
+from sb3_sparse.errors import ConfigError
 from sb3_sparse.sparsity.budgets import split_sparsity
 from sb3_sparse.sparsity.distributions import check_distribution, check_sparsity
 from sb3_sparse.sparsity.numeric import is_whole
@@ -27,23 +25,23 @@ SPARSITY_MISSING = (
 
 @dataclass(frozen=True)
 class SparsityConfig:
-    """How sparse a policy shall be.
+    """How sparse a policy is: the arguments that sparse policies take beside SB3's.
 
-    :param sparsity: removed fraction of the weights, in [0, 1), for every network, or
-        one for each network by name, e.g. ``{"actor": 0.95, "critic": 0.8}``
-    :param initial_sparsity: what training starts with; None: the same; 0.0 for pruning
+    :param sparsity: removed fraction of the weights, in [0, 1), for every network, or one for each
+        network by name, e.g. ``{"actor": 0.95, "critic": 0.8}``; required
+    :param initial_sparsity: sparsity at the start of training, e.g. 0.0 for pruning; None: the same
     :param distribution: ``"erk"``, ``"er"`` or ``"uniform"``
     :param actor_share: fraction of all remaining connections that the actor gets (all critics
         counted); None: actor and critic equally sparse
     :param dense_layers: layers left dense and outside the budget, by name pattern
         (``"actor.mu"``, ``"critic.qf*.4"``) or by the words ``"input"`` and ``"output"``
-    :param sparsity_aware_init: draw the weights by the fans that are there (a network that starts
-        dense keeps SB3's own)
-    :param weight_decay: coupled L2 on weights only
-    :param mask_seed: seed of masks and growth; None: read off torch's generator without advancing
-        it, so that SB3's ``seed`` decides
+    :param sparsity_aware_init: scale initial weights by the connections that each unit has; a
+        network that starts dense keeps SB3's initial weights
+    :param weight_decay: coefficient of coupled L2 regularisation of the weights, not of biases
+    :param mask_seed: seed of masks and growth; None: follows from SB3's ``seed``
     :param compute: ``"masked"``: dense weights and masks; ``"sparse"``: linear layers store and
-        compute their active connections only; ``"auto"``: large and sparse ones do
+        compute only their active connections; ``"auto"``: large and sparse layers do, by a rule of
+        shapes and counts (docs/compute.md)
     :raises ConfigError: for a value that is not allowed
     :raises MissingKernels: for ``compute="sparse"`` without compiled kernels
     """
@@ -66,8 +64,8 @@ class SparsityConfig:
                 check_sparsity(value, f"sparsity of {name!r}")
             if self.actor_share is not None:
                 raise ConfigError(
-                    "sparsity is given for each network and actor_share as well; give one number "
-                    "as sparsity to have it shared out"
+                    "actor_share divides one sparsity between both networks, but sparsity is given "
+                    "for each network; give one number, or leave actor_share out"
                 )
         else:
             check_sparsity(self.sparsity)
@@ -98,7 +96,7 @@ class SparsityConfig:
 
     @classmethod
     def pop_from(cls, kwargs: dict[str, Any]) -> SparsityConfig:
-        """The config that keyword arguments of a policy say, which are removed from them."""
+        """Make a config of the keyword arguments that are its fields, and remove these."""
         names = [one.name for one in fields(cls) if one.name in kwargs]
         return cls(**{"sparsity": None, **{name: kwargs.pop(name) for name in names}})
 
@@ -129,7 +127,7 @@ class SparsityConfig:
     def initial(self, network: str, final: float) -> float:
         """The sparsity that a network starts with.
 
-        :param final: what it shall have in the end
+        :param final: the sparsity that it ends with
         :raises ConfigError: if it would start sparser than it ends
         """
         if self.initial_sparsity is None:
@@ -140,35 +138,3 @@ class SparsityConfig:
                 f"{network!r}; pruning only removes, so start at or below it (0.0 is dense)"
             )
         return check_sparsity(self.initial_sparsity)
-
-
-@cache
-def arguments_of(cls: type) -> frozenset[str]:
-    """Names that a class takes when made, but those that every SB3 class is given.
-
-    What a constructor does not name itself but takes as ``**kwargs`` is its base class's.
-    """
-    names: set[str] = set()
-    for base in cls.__mro__:
-        if "__init__" not in vars(base):
-            continue
-        parameters = inspect.signature(vars(base)["__init__"]).parameters
-        names.update(parameters)
-        if not any(one.kind is one.VAR_KEYWORD for one in parameters.values()):
-            break
-    given = "self args kwargs env observation_space action_space lr_schedule _init_setup_model"
-    return frozenset(names - {*given.split()})
-
-
-def check_arguments(policy: type, given: Iterable[str]) -> None:
-    """Check names of keyword arguments.
-
-    :raises ConfigError: for one that the policy class does not take
-    """
-    known = arguments_of(policy)
-    for name in given:
-        if name not in known:
-            raise ConfigError(
-                f"{policy.__name__} has no argument {name!r}{did_you_mean(name, known)}; it takes "
-                f"{', '.join(sorted(known))}"
-            )

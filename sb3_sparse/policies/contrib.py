@@ -9,22 +9,21 @@ from typing import Any, NoReturn
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, NatureCNN
 from stable_baselines3.common.type_aliases import Schedule
 
 from sb3_sparse.engine.internals import become
 from sb3_sparse.errors import MissingExtra, UnsupportedError
-from sb3_sparse.policies.acting import Actions
 from sb3_sparse.policies.actor_critic import SparseActorCriticPolicy
 from sb3_sparse.policies.base import BaseSparsePolicy
 from sb3_sparse.policies.critics import SparseCritic, SparseCriticsMixin
-from sb3_sparse.policies.gaussian import GaussianActor
-from sb3_sparse.policies.parts import ActingPart, ActsByPart
+from sb3_sparse.policies.fast_predict import Actions
+from sb3_sparse.policies.gaussian_actor import GaussianActor
+from sb3_sparse.policies.modules import ActingModule, PredictsByModule
 from sb3_sparse.policies.registry import (
     register_policy,
     reject,
     supported_algorithms,
-    with_extractor,
+    variants_of,
 )
 from sb3_sparse.policies.sac import GAUSSIAN_ACTING, GAUSSIAN_ACTOR, TWIN_CRITIC, sac_passes
 from sb3_sparse.policies.spec import NetworkSpec, PassCounts, value_passes
@@ -51,7 +50,15 @@ class SparseTQCCritic(SparseCritic, Critic):
 
 @register_policy(TQC, passes=sac_passes)
 class SparseTQCPolicy(SparseCriticsMixin, TQCPolicy):
-    """Sparse actor and quantile critics for TQC."""
+    """Sparse actor and quantile critics for TQC.
+
+    Example::
+
+        from sb3_contrib import TQC
+        from sb3_sparse import SparseTQCPolicy
+
+        model = TQC(SparseTQCPolicy, "Pendulum-v1", policy_kwargs=dict(sparsity=0.9))
+    """
 
     acting = GAUSSIAN_ACTING
     actor_class = SparseTQCActor
@@ -59,12 +66,10 @@ class SparseTQCPolicy(SparseCriticsMixin, TQCPolicy):
     networks = {"actor": GAUSSIAN_ACTOR, "critic": TWIN_CRITIC}
 
 
-SparseTQCMlpPolicy = with_extractor(SparseTQCPolicy, "Mlp", FlattenExtractor)
-SparseTQCCnnPolicy = with_extractor(SparseTQCPolicy, "Cnn", NatureCNN)
-SparseTQCMultiInputPolicy = with_extractor(SparseTQCPolicy, "MultiInput", CombinedExtractor)
+SparseTQCMlpPolicy, SparseTQCCnnPolicy, SparseTQCMultiInputPolicy = variants_of(SparseTQCPolicy)
 
 
-class SparseQuantileNetwork(ActingPart, QuantileNetwork):
+class SparseQuantileNetwork(ActingModule, QuantileNetwork):
     """Quantile network of QR-DQN."""
 
     paths = (("quantile_net",),)
@@ -79,7 +84,7 @@ class SparseQuantileNetwork(ActingPart, QuantileNetwork):
     def _quantiles(self, result: th.Tensor) -> th.Tensor:
         return result.view(-1, self.n_quantiles, int(self.action_space.n))
 
-    def decide(self, results: list[Actions], deterministic: bool) -> Actions:
+    def actions_from(self, results: list[Actions], deterministic: bool) -> Actions:
         """The actions that are best in the mean, shape ``(n,)``."""
         values = self._quantiles(th.from_numpy(results[0])).mean(dim=1)
         best: Actions = values.argmax(dim=1).numpy()
@@ -87,8 +92,16 @@ class SparseQuantileNetwork(ActingPart, QuantileNetwork):
 
 
 @register_policy(QRDQN, passes=value_passes("quantile_net"))
-class SparseQRDQNPolicy(ActsByPart, BaseSparsePolicy, QRDQNPolicy):
-    """Sparse quantile network for QR-DQN."""
+class SparseQRDQNPolicy(PredictsByModule, BaseSparsePolicy, QRDQNPolicy):
+    """Sparse quantile network for QR-DQN.
+
+    Example::
+
+        from sb3_contrib import QRDQN
+        from sb3_sparse import SparseQRDQNPolicy
+
+        model = QRDQN(SparseQRDQNPolicy, "CartPole-v1", policy_kwargs=dict(sparsity=0.9))
+    """
 
     acting = ("quantile_net.features_extractor", "quantile_net.quantile_net")
     acting_quantiles = "quantile_net.n_quantiles"
@@ -104,22 +117,22 @@ class SparseQRDQNPolicy(ActsByPart, BaseSparsePolicy, QRDQNPolicy):
     }
 
     def make_quantile_net(self) -> SparseQuantileNetwork:
-        """As in sb3-contrib, of our class."""
+        """As in sb3-contrib, of our own class."""
         kwargs = self._update_features_extractor(self.net_args, features_extractor=None)
         return SparseQuantileNetwork(**kwargs).to(self.device)
 
 
-SparseQRDQNMlpPolicy = with_extractor(SparseQRDQNPolicy, "Mlp", FlattenExtractor)
-SparseQRDQNCnnPolicy = with_extractor(SparseQRDQNPolicy, "Cnn", NatureCNN)
-SparseQRDQNMultiInputPolicy = with_extractor(SparseQRDQNPolicy, "MultiInput", CombinedExtractor)
+SparseQRDQNMlpPolicy, SparseQRDQNCnnPolicy, SparseQRDQNMultiInputPolicy = variants_of(
+    SparseQRDQNPolicy
+)
 
 
 class SoundBatchRenorm1d(BatchRenorm1d):
     """BatchRenorm that passes no NaN back to a unit that is constant over the batch.
 
-    Once its warm-up is over, sb3-contrib's takes the square root of the batch's variance, whose
-    derivative at 0 is infinite. Units without an input, which sparse layers have, are constant.
-    They get the gradient 0.
+    After its warm-up, sb3-contrib's takes the square root of the batch's variance, whose derivative
+    at 0 is infinite. Units without inputs, which sparse layers have, are constant; their gradient
+    is 0 here.
     """
 
     def forward(self, x: th.Tensor) -> th.Tensor:
@@ -158,7 +171,16 @@ def crossq_passes(model: Any) -> list[PassCounts]:
 
 @register_policy(CrossQ, passes=crossq_passes)
 class SparseCrossQPolicy(SparseCriticsMixin, CrossQPolicy):
-    """Sparse actor and critics for CrossQ, which has no target network."""
+    """Sparse actor and critics for CrossQ, which has no target network.
+
+    Example::
+
+        from sb3_contrib import CrossQ
+        from sb3_sparse import SparseCrossQPolicy
+
+        kwargs = dict(sparsity=0.9, net_arch=[64, 64])
+        model = CrossQ(SparseCrossQPolicy, "Pendulum-v1", policy_kwargs=kwargs)
+    """
 
     acting = GAUSSIAN_ACTING
     actor_class = SparseCrossQActor
@@ -177,14 +199,14 @@ class SparseCrossQPolicy(SparseCriticsMixin, CrossQPolicy):
                 become(module, SoundBatchRenorm1d)
 
 
-SparseCrossQMlpPolicy = with_extractor(SparseCrossQPolicy, "Mlp", FlattenExtractor)
+(SparseCrossQMlpPolicy,) = variants_of(SparseCrossQPolicy, "Mlp")
 
 
 register_policy(TRPO, told_by="cg_max_steps")(SparseActorCriticPolicy)
 
 
 class _NoSparsePolicy(BasePolicy):
-    """Stands in for the sparse policy of an algorithm that has none, and says so."""
+    """Stands in for the sparse policy of an algorithm that has none, and raises an error."""
 
     algorithm: str
 

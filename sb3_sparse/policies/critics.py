@@ -1,9 +1,9 @@
-"""Critics that compute no gradient that nobody uses."""
+"""Critics that skip gradients that nobody uses."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import Any, ClassVar
 
 import torch as th
@@ -13,7 +13,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
 from sb3_sparse.policies.base import BaseSparsePolicy
-from sb3_sparse.policies.parts import ActingPart, ActsByPart, SparsePart
+from sb3_sparse.policies.modules import ActingModule, PredictsByModule, SparseModule
 
 
 @contextmanager
@@ -28,17 +28,15 @@ def _frozen(module: nn.Module) -> Iterator[None]:
             parameter.requires_grad_(True)
 
 
-class SparseCritic(SparsePart):
+class SparseCritic(SparseModule):
     """A critic whose own weights get no gradient where its actions have one.
 
-    That is the actor's loss, in every algorithm: SB3 computes the critic's gradients there too and
-    throws them away. The critic's own loss takes its actions from the replay buffer.
+    That is so in the actor's loss of every algorithm: SB3 computes the critic's gradients there too
+    and throws them away. The critic's own loss takes its actions from the replay buffer.
     """
 
     def forward(self, obs: Any, actions: th.Tensor) -> Any:
-        if not actions.requires_grad:
-            return super().forward(obs, actions)
-        with _frozen(self):
+        with _frozen(self) if actions.requires_grad else nullcontext():
             return super().forward(obs, actions)
 
 
@@ -46,27 +44,25 @@ class SparseContinuousCritic(SparseCritic, ContinuousCritic):
     """Critic of SAC, TD3 and DDPG."""
 
     def q1_forward(self, obs: Any, actions: th.Tensor) -> th.Tensor:
-        if not actions.requires_grad:
-            return super().q1_forward(obs, actions)
-        with _frozen(self):
+        with _frozen(self) if actions.requires_grad else nullcontext():
             return super().q1_forward(obs, actions)
 
 
-class SparseCriticsMixin(ActsByPart, BaseSparsePolicy):
-    """What the policies of SAC, TD3, DDPG, TQC and CrossQ have in common."""
+class SparseCriticsMixin(PredictsByModule, BaseSparsePolicy):
+    """Policies of algorithms with an actor and critics of its actions."""
 
     action_spaces = (spaces.Box,)
-    actor_class: ClassVar[type[ActingPart]]
+    actor_class: ClassVar[type[ActingModule]]
     critic_class: ClassVar[type[SparseCritic]] = SparseContinuousCritic
     actor_kwargs: dict[str, Any]
     critic_kwargs: dict[str, Any]
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Any:
-        """As in SB3, of :attr:`actor_class`."""
+        """As in SB3, but an :attr:`actor_class`."""
         kwargs = self._update_features_extractor(self.actor_kwargs, features_extractor)
         return self.actor_class(**kwargs).to(self.device)
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> Any:
-        """As in SB3, of :attr:`critic_class`."""
+        """As in SB3, but a :attr:`critic_class`."""
         kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
         return self.critic_class(**kwargs).to(self.device)

@@ -7,17 +7,16 @@ from typing import Any
 import torch as th
 from gymnasium import spaces
 from stable_baselines3 import DQN
-from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, NatureCNN
 from stable_baselines3.dqn.policies import DQNPolicy, QNetwork
 
-from sb3_sparse.policies.acting import Actions
 from sb3_sparse.policies.base import BaseSparsePolicy
-from sb3_sparse.policies.parts import ActingPart, ActsByPart
-from sb3_sparse.policies.registry import register_policy, with_extractor
+from sb3_sparse.policies.fast_predict import Actions
+from sb3_sparse.policies.modules import ActingModule, PredictsByModule
+from sb3_sparse.policies.registry import register_policy, variants_of
 from sb3_sparse.policies.spec import NetworkSpec, value_passes
 
 
-class SparseQNetwork(ActingPart, QNetwork):
+class SparseQNetwork(ActingModule, QNetwork):
     """Q network of DQN."""
 
     paths = (("q_net",),)
@@ -27,15 +26,23 @@ class SparseQNetwork(ActingPart, QNetwork):
         results = self.results(obs)
         return super().forward(obs) if results is None else results[0]
 
-    def decide(self, results: list[Actions], deterministic: bool) -> Actions:
+    def actions_from(self, results: list[Actions], deterministic: bool) -> Actions:
         """The best actions, shape ``(n,)``."""
         best: Actions = results[0].argmax(axis=1)
         return best
 
 
 @register_policy(DQN, passes=value_passes("q_net"))
-class SparseDQNPolicy(ActsByPart, BaseSparsePolicy, DQNPolicy):
-    """Sparse Q network for DQN."""
+class SparseDQNPolicy(PredictsByModule, BaseSparsePolicy, DQNPolicy):
+    """Sparse Q network for DQN.
+
+    Example::
+
+        from sb3_sparse import DQN, SparseDQNPolicy
+
+        kwargs = dict(sparsity=0.9, net_arch=[256, 256])
+        model = DQN(SparseDQNPolicy, "CartPole-v1", policy_kwargs=kwargs)
+    """
 
     acting = ("q_net.features_extractor", "q_net.q_net")
     action_spaces = (spaces.Discrete,)
@@ -50,11 +57,9 @@ class SparseDQNPolicy(ActsByPart, BaseSparsePolicy, DQNPolicy):
     }
 
     def make_q_net(self) -> SparseQNetwork:
-        """As in SB3, of our class."""
+        """As in SB3, of our own class."""
         kwargs = self._update_features_extractor(self.net_args, features_extractor=None)
         return SparseQNetwork(**kwargs).to(self.device)
 
 
-SparseDQNMlpPolicy = with_extractor(SparseDQNPolicy, "Mlp", FlattenExtractor)
-SparseDQNCnnPolicy = with_extractor(SparseDQNPolicy, "Cnn", NatureCNN)
-SparseDQNMultiInputPolicy = with_extractor(SparseDQNPolicy, "MultiInput", CombinedExtractor)
+SparseDQNMlpPolicy, SparseDQNCnnPolicy, SparseDQNMultiInputPolicy = variants_of(SparseDQNPolicy)

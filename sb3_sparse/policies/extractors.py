@@ -1,4 +1,4 @@
-"""The features extractor that SB3 would choose."""
+"""The features extractor that SB3 would choose, and copies of a user's modules."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SUPPORTED = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBina
 def choose_extractor(
     observation_space: spaces.Space[Any], normalize_images: bool
 ) -> type[BaseFeaturesExtractor]:
-    """NatureCNN for images, CombinedExtractor for dicts, else flat.
+    """The default class: NatureCNN for images, CombinedExtractor for dicts, else FlattenExtractor.
 
     :raises UnsupportedError: for an observation space that SB3 cannot preprocess
     """
@@ -41,10 +41,10 @@ def choose_extractor(
 
 
 def copied_modules(value: Any, memo: dict[int, Any] | None = None) -> Any:
-    """The same value with copies of all modules and tensors in it, however nested; the rest stays.
+    """Copy all modules and tensors in a nested value; everything else is shared.
 
-    :param value: keyword arguments, say
-    :param memo: what was copied already, so that what is shared stays shared
+    :param value: for instance keyword arguments
+    :param memo: copies made so far, so that a module given twice is copied once
     """
     memo = {} if memo is None else memo
     if isinstance(value, (nn.Module, th.Tensor)):

@@ -1,6 +1,7 @@
-"""The algorithms that have a sparse policy, by name.
+"""The algorithms that have a sparse policy.
 
-Names are known without torch. Whoever asks for a class imports the module that registers it.
+Their names are known without torch. The modules that register them are imported when a class is
+asked for.
 """
 
 from __future__ import annotations
@@ -41,13 +42,7 @@ Policy = TypeVar("Policy", bound="BaseSparsePolicy")
 
 @dataclass(frozen=True)
 class Registration:
-    """An algorithm and its sparse policy, as :func:`register_policy` was told.
-
-    :param algorithm: the algorithm's class
-    :param policy: the class of its sparse policy
-    :param passes: counts the passes of a gradient step; None: not known
-    :param told_by: attribute that tells its models from others' with the same policy
-    """
+    """An algorithm and its sparse policy; the fields are arguments of :func:`register_policy`."""
 
     algorithm: type[BaseAlgorithm]
     policy: type[BaseSparsePolicy]
@@ -59,17 +54,17 @@ class Registration:
         """The policy class that :attr:`policy` makes sparse."""
         from stable_baselines3.common.policies import BasePolicy
 
-        from sb3_sparse.policies.modes import SwitchesModes
+        from sb3_sparse.policies.training_mode import FastModeSwitch
 
         return next(
             cls
             for cls in self.policy.__mro__
-            if issubclass(cls, BasePolicy) and not issubclass(cls, SwitchesModes)
+            if issubclass(cls, BasePolicy) and not issubclass(cls, FastModeSwitch)
         )
 
 
 _registered: dict[str, Registration] = {}
-_variants: dict[type[BaseSparsePolicy], dict[str, type[BaseSparsePolicy]]] = {}
+_variants: dict[type[BaseSparsePolicy], Mapping[str, type[BaseSparsePolicy]]] = {}
 _rejected: list[type[BaseAlgorithm]] = []
 
 
@@ -78,17 +73,17 @@ def register_policy(
 ) -> Callable[[type[Policy]], type[Policy]]:
     """Class decorator that makes a class the sparse policy of an algorithm.
 
-    The algorithm then takes ``"SparsePolicy"``, and all commands know it by its lower-case name. ::
+    The algorithm then takes ``"SparsePolicy"``, and every command knows its lower-case name. ::
 
         @register_policy(MySAC)
         class MySACPolicy(SparseSACPolicy): ...
 
     :param algorithm: class of the algorithm
-    :param passes: counts the passes of one gradient step of a model, for
-        :func:`sb3_sparse.analysis.flops`. Not needed where ``train()`` is that of a registered
-        algorithm
-    :param told_by: attribute of its models that those of other algorithms with the same policy
-        class lack. It tells what a zip was saved by
+    :param passes: function of a model that counts the passes of one gradient step, for
+        :func:`sb3_sparse.analysis.flops`; not needed if the algorithm inherits ``train()`` from a
+        registered one
+    :param told_by: attribute of its models that models of other algorithms with the same policy
+        class lack; tells which algorithm saved a zip
     :raises ConfigError: if another algorithm has that name already
     """
 
@@ -112,30 +107,37 @@ def register_policy(
     return register
 
 
-def with_extractor(
-    policy: type[Policy], prefix: str, extractor: type[BaseFeaturesExtractor]
-) -> type[Policy]:
-    """A subclass of a sparse policy with another default features extractor.
+def variants_of(policy: type[Policy], *prefixes: str) -> list[type[Policy]]:
+    """Subclasses of a sparse policy with SB3's features extractors by default.
 
-    The algorithms that the policy is registered for know it as ``"Sparse<prefix>Policy"``.
+    The algorithms that the policy is registered for know them as ``"Sparse<prefix>Policy"``. The
+    policy's module must bind each to its own name, e.g. ``SparseSACMlpPolicy``, for pickle.
 
     :param policy: a registered policy class
-    :param prefix: put between the class name and ``Policy``, e.g. ``"Cnn"``; the module must bind
-        the class to that name, or it cannot be pickled
-    :param extractor: class of the features extractor
+    :param prefixes: some of ``"Mlp"``, ``"Cnn"`` and ``"MultiInput"``; none: all of these
     """
-    name = policy.__name__.removesuffix("Policy") + prefix + "Policy"
-    members = {
-        "__module__": policy.__module__,
-        "__doc__": f"{policy.__name__} with {extractor.__name__} by default.",
-        "extractor_class": extractor,
+    from stable_baselines3.common import torch_layers
+
+    extractors: dict[str, type[BaseFeaturesExtractor]] = {
+        "Mlp": torch_layers.FlattenExtractor,
+        "Cnn": torch_layers.NatureCNN,
+        "MultiInput": torch_layers.CombinedExtractor,
     }
-    variant = type(name, (policy,), members)
-    _variants.setdefault(policy, {})[prefix] = variant
+    found = {}
+    for prefix in prefixes or extractors:
+        extractor = extractors[prefix]
+        members = {
+            "__module__": policy.__module__,
+            "__doc__": f"{policy.__name__} with {extractor.__name__} by default.",
+            "extractor_class": extractor,
+        }
+        name = policy.__name__.removesuffix("Policy") + prefix + "Policy"
+        found[prefix] = type(name, (policy,), members)
+    _variants[policy] = found
     for one in _registered.values():
         if one.policy is policy:
-            _add_aliases(one.algorithm, {prefix: variant})
-    return variant
+            _add_aliases(one.algorithm, found)
+    return list(found.values())
 
 
 def _add_aliases(algorithm: type[BaseAlgorithm], policies: Mapping[str, type[BasePolicy]]) -> None:
@@ -144,9 +146,9 @@ def _add_aliases(algorithm: type[BaseAlgorithm], policies: Mapping[str, type[Bas
 
 
 def reject(algorithm: type[BaseAlgorithm], policy: type[BasePolicy]) -> None:
-    """Let an algorithm that has no sparse policy say so.
+    """Give an algorithm without a sparse policy one that raises an error instead.
 
-    :param policy: raises an error when made
+    :param policy: raises when it is made
     """
     _add_aliases(algorithm, dict.fromkeys(("", "Mlp", "Cnn", "MultiInput"), policy))
     _rejected.append(algorithm)

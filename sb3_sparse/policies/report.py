@@ -1,9 +1,9 @@
-"""A table of a policy's layers."""
+"""The report on a policy's layers: shapes, connections, FLOPs."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,13 +18,13 @@ from torch import nn
 from sb3_sparse.engine.network import SparseNetwork
 from sb3_sparse.engine.prunable import Prunable
 from sb3_sparse.policies.internals import space_of
-from sb3_sparse.policies.spec import NetworkSpec
+from sb3_sparse.policies.spec import NetworkSpec, in_target
 
 SPARSE = "sparse"
 MASKED = "masked"
 DENSE = "dense"
 COMPUTES = (SPARSE, MASKED, DENSE)
-"""How a layer may compute."""
+"""How a layer can compute."""
 
 
 def compute_of(is_sparse: bool, nnz: int, size: int) -> str:
@@ -41,15 +41,16 @@ def compute_of(is_sparse: bool, nnz: int, size: int) -> str:
 
 @dataclass(frozen=True)
 class LayerReport:
-    """One layer.
+    """One layer in a report.
 
     :param network: name of the network that it belongs to
     :param name: dotted name within the policy
     :param shape: weight shape, torch order
     :param nnz: active connections
     :param parameters: nnz and biases
-    :param flops: of one forward pass at batch 1: multiply-adds count 2, biases and activations 1
-    :param dense_flops: the same for the dense layer; 0: not known, and neither are ``flops``
+    :param flops: FLOPs of one forward pass at batch 1: 2 for a multiply-add, 1 for each bias and
+        activation
+    :param dense_flops: the same for the dense layer; 0: neither these nor ``flops`` are known
     :param in_budget: False for a layer left dense by ``dense_layers``
     :param compute: how it computes: ``"sparse"``: with its active connections only;
         ``"masked"``: with a dense weight that is 0 where inactive; ``"dense"``: all are active
@@ -78,7 +79,7 @@ class LayerReport:
 
 @dataclass(frozen=True)
 class SparsityReport:
-    """All layers of a policy, target networks not counted."""
+    """All layers of a policy, without target networks; ``print`` it for a table."""
 
     layers: tuple[LayerReport, ...]
 
@@ -116,35 +117,39 @@ class SparsityReport:
         known = all(r.dense_flops for r in self.layers)
         total = ("total", "", f"{self.nnz:,}", f"{self.nnz / size:.4f}")
         rows.append((*total, *_costs(flops, dense if known else 0), ""))
-        widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
-        lines = [
-            "  ".join(
-                cell.ljust(width) if i < 2 else cell.rjust(width)
-                for i, (cell, width) in enumerate(zip(row, widths, strict=True))
-            ).rstrip()
-            for row in (head, *rows)
-        ]
         networks = list(dict.fromkeys(r.network for r in self.layers))
         summary = ", ".join(f"{name} {self.sparsity(name):.4f}" for name in networks)
         return "\n".join(
             [
-                *lines,
+                *table_lines([head, *rows]),
                 f"sparsity: {summary}, total {self.sparsity():.4f}",
                 f"parameters: {self.parameters:,} (active connections and biases)",
             ]
         )
 
 
+def table_lines(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Lines of a text table: the first two columns to the left, numbers to the right."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return [
+        "  ".join(
+            cell.ljust(width) if i < 2 else cell.rjust(width)
+            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in rows
+    ]
+
+
 def _costs(flops: int, dense_flops: int) -> tuple[str, str]:
-    """FLOPs and their share of the dense ones; question marks where these are not known."""
+    """FLOPs and their share of the dense ones, or question marks where these are not known."""
     return (f"{flops:,}", f"{flops / dense_flops:.3f}") if dense_flops else ("?", "?")
 
 
-def report_on(policy: BasePolicy, networks: Iterable[SparseNetwork]) -> SparsityReport:
-    """Collect the report of a policy as it is now.
+def build_report(policy: BasePolicy, networks: Iterable[SparseNetwork]) -> SparsityReport:
+    """The report on a policy as it is now.
 
     :param policy: sparse or dense
-    :param networks: its networks; of a dense policy with all layers outside the budget
+    :param networks: its networks; those of a dense policy have all layers outside the budget
     """
     positions = _conv_positions(policy)
     activated = _activated(policy)
@@ -181,14 +186,13 @@ def report_on(policy: BasePolicy, networks: Iterable[SparseNetwork]) -> Sparsity
 
 
 def _other_matrices(policy: BasePolicy, counted: set[int]) -> list[LayerReport]:
-    """Trained matrices that belong to no Linear or Conv layer, which are dense: embeddings, say.
+    """Trained matrices outside Linear and Conv layers, which are dense: embeddings, for instance.
 
-    A ``log_std`` is no connection, and targets do not count.
+    A ``log_std`` is not counted, nor are target networks.
 
-    :param counted: ids of the weights that are in the report already
+    :param counted: ids of the weights that the report has already
     """
     specs: Mapping[str, NetworkSpec] = getattr(policy, "networks", {})
-    targets = tuple(f"{spec.target}." for spec in specs.values() if spec.target is not None)
     found = []
     for name, parameter in policy.named_parameters() if specs else ():
         if (
@@ -196,7 +200,7 @@ def _other_matrices(policy: BasePolicy, counted: set[int]) -> list[LayerReport]:
             or not parameter.requires_grad
             or id(parameter) in counted
             or name.rpartition(".")[2] == "log_std"
-            or name.startswith(targets)
+            or in_target(name, specs)
         ):
             continue
         within = [n for n, spec in specs.items() if name.startswith(spec.roots)]
@@ -229,7 +233,7 @@ def _activated(policy: nn.Module) -> set[int]:
 
 
 def _conv_positions(policy: BasePolicy) -> dict[int, int]:
-    """Output positions of each convolution, read off a forward pass of an empty observation."""
+    """Output positions of each convolution, measured in a forward pass of a zero observation."""
     positions: dict[int, int] = {}
 
     def note(module: nn.Module, inputs: object, output: th.Tensor) -> None:

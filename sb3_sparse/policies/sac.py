@@ -5,12 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 from stable_baselines3 import SAC
-from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, NatureCNN
 from stable_baselines3.sac.policies import Actor, SACPolicy
 
 from sb3_sparse.policies.critics import SparseCriticsMixin
-from sb3_sparse.policies.gaussian import GaussianActor
-from sb3_sparse.policies.registry import register_policy, with_extractor
+from sb3_sparse.policies.gaussian_actor import GaussianActor
+from sb3_sparse.policies.registry import register_policy, variants_of
 from sb3_sparse.policies.spec import NetworkSpec, PassCounts
 
 GAUSSIAN_ACTOR = NetworkSpec(
@@ -45,13 +44,19 @@ def sac_passes(model: Any) -> list[PassCounts]:
 
 @register_policy(SAC, passes=sac_passes)
 class SparseSACPolicy(SparseCriticsMixin, SACPolicy):
-    """Sparse actor and critics for SAC."""
+    """Sparse actor and critics for SAC.
+
+    Example::
+
+        from sb3_sparse import SAC, SparseSACPolicy
+
+        sparsity = {"actor": 0.95, "critic": 0.8}
+        model = SAC(SparseSACPolicy, "Pendulum-v1", policy_kwargs=dict(sparsity=sparsity))
+    """
 
     acting = GAUSSIAN_ACTING
     actor_class = SparseSACActor
     networks = {"actor": GAUSSIAN_ACTOR, "critic": TWIN_CRITIC}
 
 
-SparseSACMlpPolicy = with_extractor(SparseSACPolicy, "Mlp", FlattenExtractor)
-SparseSACCnnPolicy = with_extractor(SparseSACPolicy, "Cnn", NatureCNN)
-SparseSACMultiInputPolicy = with_extractor(SparseSACPolicy, "MultiInput", CombinedExtractor)
+SparseSACMlpPolicy, SparseSACCnnPolicy, SparseSACMultiInputPolicy = variants_of(SparseSACPolicy)

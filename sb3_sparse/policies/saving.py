@@ -1,4 +1,4 @@
-"""What SB3 would write to a model's file."""
+"""The content of a model's file."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ Algorithm = TypeVar("Algorithm", bound=BaseAlgorithm)
 
 
 def parts_of(model: BaseAlgorithm) -> tuple[dict[str, Any], dict[str, Any], Any]:
-    """A model as ``save`` writes and ``load`` reads it: data, state_dicts by name, variables.
+    """A model as ``save`` writes it and ``load`` reads it: data, state_dicts by name, variables.
 
-    Copies, on the CPU.
+    The tensors are copies on the CPU.
     """
     file = io.BytesIO()
     model.save(file)
@@ -36,14 +36,14 @@ def parts_of(model: BaseAlgorithm) -> tuple[dict[str, Any], dict[str, Any], Any]
 def load_without_buffer(
     algorithm: type[Algorithm], file: str | Path | io.BufferedIOBase, **kwargs: Any
 ) -> Algorithm:
-    """A saved model with all its settings, but no replay buffer: for all except training.
+    """A saved model without a replay buffer, for everything but training.
 
-    A buffer would take memory, and that of hindsight experience replay asks for the environment.
+    A buffer would take memory, and one for hindsight experience replay needs the environment.
 
-    :param kwargs: of SB3's ``load``
+    :param kwargs: further arguments of SB3's ``load``
     """
     if issubclass(algorithm, OffPolicyAlgorithm):
-        kwargs["replay_buffer"] = object()  # SB3 makes one where there is none
+        kwargs["replay_buffer"] = object()  # or SB3 makes one
     model: Algorithm = algorithm.load(file, **kwargs)
     if isinstance(model, OffPolicyAlgorithm):
         model.replay_buffer = None
@@ -51,9 +51,9 @@ def load_without_buffer(
 
 
 def was_normalised(model: BaseAlgorithm) -> bool:
-    """Whether an on-policy model was trained under a VecNormalize, as far as it remembers.
+    """Whether an on-policy model was trained under a VecNormalize; False for others.
 
-    Off-policy models do not tell.
+    Off-policy models keep nothing that would tell.
     """
     if not isinstance(model, OnPolicyAlgorithm):
         return False
@@ -61,7 +61,7 @@ def was_normalised(model: BaseAlgorithm) -> bool:
 
 
 def differ(seen: Any, raw: Any) -> bool:
-    """Whether an observation is not what it was before normalisation; not, if one is unknown."""
+    """Whether an observation differs from what it was before normalisation; False if unknown."""
     if seen is None or raw is None:
         return False
     if isinstance(raw, dict):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from typing import Any
@@ -17,14 +17,28 @@ DENSE_WORDS = ("input", "output")
 
 @dataclass(frozen=True)
 class NetworkSpec:
-    """One network of a policy, by dotted module names (``fnmatch`` patterns where several match).
+    """One network of a policy, by dotted names of modules (``fnmatch`` patterns match several).
 
-    :param roots: modules whose layers belong to the network; one that an earlier network has
-        already (a shared features extractor) stays with that one
+    Example::
+
+        from sb3_sparse import NetworkSpec, SparseDQNPolicy
+
+        class MyPolicy(SparseDQNPolicy):
+            networks = {
+                "q_net": NetworkSpec(
+                    roots=("q_net",),
+                    trunks=("q_net.q_net",),
+                    heads=("q_net.q_net",),
+                    target="q_net_target",
+                )
+            }
+
+    :param roots: modules whose layers belong to the network; a layer that an earlier network has,
+        such as one of a shared features extractor, stays with that one
     :param trunks: modules whose first layer reads features
     :param heads: modules whose last layer is an output
-    :param target: target copy of the one root, if there is one
-    :param owner: module whose ``optimizer`` moves the network; empty: the policy
+    :param target: copy of the root in the target network; None: there is no target network
+    :param owner: module whose ``optimizer`` trains the network; empty: the policy
     """
 
     roots: tuple[str, ...]
@@ -36,16 +50,22 @@ class NetworkSpec:
 
 @dataclass(frozen=True)
 class PassCounts:
-    """Passes of one network in one gradient step, on average, for each sample of the minibatch.
+    """How often a gradient step runs one network, on average, for each sample of the minibatch.
 
-    :param network: its name
+    Example::
+
+        from sb3_sparse import PassCounts
+
+        double_dqn = [PassCounts("q_net", forward=2, backward=1), PassCounts("q_net", target=True)]
+
+    :param network: name of the network
     :param forward: forward passes
     :param backward: backward passes that give the gradient of its weights; each costs 2 forward
-    :param through: backward passes that only hand a gradient on to the network's actions; each
-        costs 1 forward, without the features extractor
-    :param target: whether they go through the target copy
-    :param leaves_out: name pattern of layers that they do not go through
-    :param shares: whether they go through layers again that another network shares
+    :param through: backward passes that only compute the gradient of its actions; each costs 1
+        forward, without the features extractor
+    :param target: whether it is the target network that runs
+    :param leaves_out: name pattern of layers that do not run
+    :param shares: whether layers that another network shares run again for this one
     """
 
     network: str
@@ -57,6 +77,12 @@ class PassCounts:
     shares: bool = True
 
 
+def in_target(name: str, specs: Mapping[str, NetworkSpec]) -> bool:
+    """Whether a dotted name lies in a target network."""
+    targets = (f"{spec.target}." for spec in specs.values() if spec.target is not None)
+    return name.startswith(tuple(targets))
+
+
 def value_passes(network: str) -> Callable[[Any], list[PassCounts]]:
     """The passes of a gradient step of DQN and QR-DQN."""
     return lambda model: [PassCounts(network, 1, 1), PassCounts(network, 1, target=True)]
@@ -64,14 +90,14 @@ def value_passes(network: str) -> Callable[[Any], list[PassCounts]]:
 
 @dataclass
 class NetworkLayers:
-    """The layers found for one network: within the budget, and left dense."""
+    """The layers of one network: those within the budget, and those left dense."""
 
     sparse: list[tuple[str, Prunable]] = field(default_factory=list)
     dense: list[tuple[str, Prunable]] = field(default_factory=list)
 
 
 def _by_module(names: Sequence[str], patterns: Sequence[str]) -> Iterator[list[str]]:
-    """Groups of layer names that lie in the same module matched by a pattern."""
+    """Layer names, grouped by the module around them that a pattern matches."""
     for pattern in patterns:
         depth = pattern.count(".") + 1
         groups: dict[str, list[str]] = {}
@@ -83,7 +109,7 @@ def _by_module(names: Sequence[str], patterns: Sequence[str]) -> Iterator[list[s
 
 
 def input_layers(policy: nn.Module, spec: NetworkSpec, names: Sequence[str]) -> set[str]:
-    """Layers that read the observation: the first of each features extractor, else of each trunk.
+    """The first layer of each features extractor; if there is none, of each trunk.
 
     :param names: layer names of the network, in module order
     """
@@ -101,7 +127,7 @@ def input_layers(policy: nn.Module, spec: NetworkSpec, names: Sequence[str]) -> 
             nested = [m for m in module.modules() if isinstance(m, BaseFeaturesExtractor)]
             layers = [name for name in names if name.startswith(f"{path}.")]
             in_extractor.update(layers)
-            if len(nested) > 1:  # a CombinedExtractor: its images have extractors of their own
+            if len(nested) > 1:  # a CombinedExtractor, with one extractor for each image
                 reads_raw |= any(isinstance(m, nn.Flatten) for m in _values(module))
             elif layers:
                 found.add(layers[0])

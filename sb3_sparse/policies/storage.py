@@ -1,6 +1,6 @@
-"""Which linear layers may store their active connections only.
+"""Which linear layers may store only their active connections.
 
-The weight of such a layer is a vector. Whoever reads it otherwise than by calling the layer, as
+The weight of such a layer is a vector. Code that reads the weight instead of calling the layer, as
 attention and tied layers do, needs the matrix.
 """
 
@@ -8,19 +8,20 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable
+from typing import Any
 
 from torch import nn
 
 from sb3_sparse.engine.storage import LayerStorage
 
 CONTAINERS = (nn.Sequential, nn.ModuleList, nn.ModuleDict)
-"""Modules of torch that do nothing with the layers in them but call them."""
-KNOWN = {"stable_baselines3", "sb3_contrib", "sb3_sparse"}
-"""Packages whose modules do nothing with the layers in them but call them."""
+"""Modules of torch that only call the layers in them."""
+KNOWN_PACKAGES = {"stable_baselines3", "sb3_contrib", "sb3_sparse"}
+"""Packages whose modules only call the layers in them."""
 
 
 def may_be_sparse(policy: nn.Module, layers: Iterable[LayerStorage], asked_for: bool) -> set[str]:
-    """Names of the layers that nobody is known to read otherwise than by calling them.
+    """Names of the layers that are only ever called, as far as is known.
 
     :param policy: the policy that the layers belong to
     :param layers: its sparse layers
@@ -45,4 +46,10 @@ def _only_calls(module: nn.Module, asked_for: bool) -> bool:
     package = type(module).__module__.partition(".")[0]
     if package == "torch":
         return isinstance(module, CONTAINERS)
-    return asked_for or package in KNOWN
+    return asked_for or is_known(type(module))
+
+
+def is_known(code: Any) -> bool:
+    """Whether a class or function belongs to one of :data:`KNOWN_PACKAGES`."""
+    package: str = code.__module__.partition(".")[0]
+    return package in KNOWN_PACKAGES

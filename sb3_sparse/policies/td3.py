@@ -6,18 +6,17 @@ from typing import Any
 
 import torch as th
 from stable_baselines3 import DDPG, TD3
-from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, NatureCNN
 from stable_baselines3.td3.policies import Actor, TD3Policy
 
-from sb3_sparse.policies.acting import Actions
 from sb3_sparse.policies.critics import SparseCriticsMixin
-from sb3_sparse.policies.parts import ActingPart
-from sb3_sparse.policies.registry import register_policy, with_extractor
+from sb3_sparse.policies.fast_predict import Actions
+from sb3_sparse.policies.modules import ActingModule
+from sb3_sparse.policies.registry import register_policy, variants_of
 from sb3_sparse.policies.sac import TWIN_CRITIC
 from sb3_sparse.policies.spec import NetworkSpec, PassCounts
 
 
-class SparseTD3Actor(ActingPart, Actor):
+class SparseTD3Actor(ActingModule, Actor):
     """Actor of TD3 and DDPG."""
 
     paths = (("mu",),)
@@ -27,7 +26,7 @@ class SparseTD3Actor(ActingPart, Actor):
         results = self.results(obs)
         return super().forward(obs) if results is None else results[0]
 
-    def decide(self, results: list[Actions], deterministic: bool) -> Actions:
+    def actions_from(self, results: list[Actions], deterministic: bool) -> Actions:
         """What the network gives, shape ``(n, dim)``."""
         return results[0]
 
@@ -48,7 +47,15 @@ def td3_passes(model: Any) -> list[PassCounts]:
 @register_policy(TD3, passes=td3_passes)
 @register_policy(DDPG, passes=td3_passes)
 class SparseTD3Policy(SparseCriticsMixin, TD3Policy):
-    """Sparse actor and critics for TD3 and DDPG."""
+    """Sparse actor and critics for TD3 and DDPG.
+
+    Example::
+
+        from sb3_sparse import TD3, SparseTD3Policy
+
+        kwargs = dict(sparsity=0.9, dense_layers=["output"])
+        model = TD3(SparseTD3Policy, "Pendulum-v1", policy_kwargs=kwargs)
+    """
 
     acting = ("actor.features_extractor", "actor.mu")
     actor_class = SparseTD3Actor
@@ -64,6 +71,4 @@ class SparseTD3Policy(SparseCriticsMixin, TD3Policy):
     }
 
 
-SparseTD3MlpPolicy = with_extractor(SparseTD3Policy, "Mlp", FlattenExtractor)
-SparseTD3CnnPolicy = with_extractor(SparseTD3Policy, "Cnn", NatureCNN)
-SparseTD3MultiInputPolicy = with_extractor(SparseTD3Policy, "MultiInput", CombinedExtractor)
+SparseTD3MlpPolicy, SparseTD3CnnPolicy, SparseTD3MultiInputPolicy = variants_of(SparseTD3Policy)

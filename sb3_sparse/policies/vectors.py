@@ -1,4 +1,4 @@
-"""All parameters as one vector, dense in every storage: what SB3's evolution strategies use."""
+"""All parameters as one vector with dense weights, as SB3's evolution strategies use it."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ def to_vector(root: nn.Module) -> NDArray[np.float32]:
 
 
 def from_vector(root: nn.Module, vector: NDArray[Any]) -> None:
-    """Load what :func:`to_vector` gave, from any storage and any mask.
+    """Load a vector that :func:`to_vector` returned, of any storage and any mask.
 
-    A value of an inactive connection is dropped; a warning says how many were not 0.
+    Values of inactive connections are dropped; a warning says how many were not 0.
 
     :param root: a policy, or an actor or critic of one
     :param vector: shape ``(n,)``
@@ -67,7 +67,7 @@ def from_vector(root: nn.Module, vector: NDArray[Any]) -> None:
     if dropped:
         warn(
             f"{dropped} of the vector's values belong to inactive connections and were dropped; "
-            "what is inactive stays 0"
+            "inactive connections stay 0"
         )
 
 

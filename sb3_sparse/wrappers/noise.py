@@ -1,4 +1,4 @@
-"""Noise on observations."""
+"""Wrappers that add noise to observations."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ Array = NDArray[Any]
 
 
 class Noise(gym.ObservationWrapper[Any, Any, Any], gym.utils.RecordConstructorArgs):
-    """What both noises share: a generator of their own, which ``reset(seed=...)`` seeds.
+    """Base class with a generator for the noise, which ``reset(seed=...)`` seeds.
 
-    The environment's own randomness is not touched, so that the same seed gives the same episode
-    with and without noise (as long as the same actions are taken).
+    The environment's own generator is not used, so that the same seed and the same actions give
+    the same episode with and without noise.
 
     :param env: environment
     :param sigma: standard deviation, 0 or more
@@ -43,7 +43,7 @@ class Noise(gym.ObservationWrapper[Any, Any, Any], gym.utils.RecordConstructorAr
             self.generator = np.random.default_rng(seed)
         return super().reset(seed=seed, options=options)
 
-    def _refuse(self, takes: str, instead: str) -> ConfigError:
+    def _rejected(self, takes: str, instead: str) -> ConfigError:
         return ConfigError(
             f"{type(self).__name__} takes {takes}, got {self.observation_space}; {instead}"
         )
@@ -60,14 +60,14 @@ class PixelNoise(Noise):
     :raises ConfigError: for other observations or a negative sigma
 
     Source: arXiv:2206.10369, section on noise robustness. Its reference code wraps around at 0 and
-    255, which is not copied.
+    255, unlike here.
     """
 
     def __init__(self, env: gym.Env[Any, Any], sigma: float) -> None:
         super().__init__(env, sigma)
         space = self.observation_space
         if not isinstance(space, spaces.Box) or space.dtype != np.uint8:
-            raise self._refuse("images of type uint8", "vectors take ObservationNoise")
+            raise self._rejected("images of type uint8", "vectors take ObservationNoise")
 
     def observation(self, observation: Array) -> Array:
         """The noisy image, uint8, of the same shape."""
@@ -92,7 +92,7 @@ class ObservationNoise(Noise):
         super().__init__(env, sigma, std=std)
         space = self.observation_space
         if not isinstance(space, spaces.Box) or not np.issubdtype(space.dtype, np.floating):
-            raise self._refuse("vectors of floats", "images take PixelNoise")
+            raise self._rejected("vectors of floats", "images take PixelNoise")
         self.space = space
         self.seen = self._nothing_seen() if std is None else None
         self.std = np.zeros(space.shape) if std is None else np.asarray(std, np.float64)
@@ -107,7 +107,7 @@ class ObservationNoise(Noise):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Array, dict[str, Any]]:
-        """As in Gymnasium; a seed makes everything that follows depend on it alone."""
+        """As in Gymnasium; after a seed, all noise depends on it alone."""
         if seed is not None and self.seen is not None:
             self.seen = self._nothing_seen()
         return super().reset(seed=seed, options=options)

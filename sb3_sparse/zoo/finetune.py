@@ -15,7 +15,7 @@ from sb3_sparse.loading.statistics import load_statistics
 from sb3_sparse.loading.text import read_text
 from sb3_sparse.loading.zips import look_into
 from sb3_sparse.loading.zooyaml import NotBuilt
-from sb3_sparse.policies.named import import_path
+from sb3_sparse.policies.arguments import import_path
 from sb3_sparse.sparsity.numeric import is_whole
 from sb3_sparse.zoo.environments import import_packages, is_atari, known_environment
 from sb3_sparse.zoo.folder import CONFIG, RESTORE, arguments_of, params_of

@@ -10,7 +10,7 @@ from typing import Any
 from sb3_sparse.engine.auto import choose
 from sb3_sparse.loading.zips import check_state, look_into
 from sb3_sparse.policies.report import SPARSE, SparsityReport
-from sb3_sparse.policies.storage import KNOWN
+from sb3_sparse.policies.storage import KNOWN_PACKAGES
 from sb3_sparse.zoo.computing import Computing, computing_in, layers_in
 from sb3_sparse.zoo.folder import arguments_of, is_run, model_in, zip_path
 from sb3_sparse.zoo.outline import Outline, outline_of
@@ -107,4 +107,4 @@ def _known(written: object) -> bool:
     module = written.get("__module__") if isinstance(written, dict) else written
     if not isinstance(module, str):
         return True
-    return module.removeprefix("<class '").partition(".")[0] in KNOWN
+    return module.removeprefix("<class '").partition(".")[0] in KNOWN_PACKAGES

@@ -17,7 +17,7 @@ from sb3_sparse.errors import ConfigError, CorruptStateError
 from sb3_sparse.policies.compiled import plain_names
 from sb3_sparse.policies.registry import registered
 from sb3_sparse.policies.report import LayerReport, SparsityReport, compute_of
-from sb3_sparse.policies.spec import NetworkSpec
+from sb3_sparse.policies.spec import NetworkSpec, in_target
 from sb3_sparse.zoo.positions import positions_of
 
 WEIGHT, MASK, BIAS = ".weight", ".weight_mask", ".bias"
@@ -115,7 +115,6 @@ def _below(name: str, roots: tuple[str, ...]) -> bool:
 
 def _networks(state: Mapping[str, Any], specs: Mapping[str, NetworkSpec]) -> dict[str, str]:
     """Names of the layers and of their networks, each weight once, targets left out."""
-    targets = tuple(f"{spec.target}." for spec in specs.values() if spec.target is not None)
     names = [
         key.removesuffix(WEIGHT)
         for key, value in state.items()
@@ -132,7 +131,7 @@ def _networks(state: Mapping[str, Any], specs: Mapping[str, NetworkSpec]) -> dic
     for name in names:  # of a policy with networks of its own
         if name + MASK in state and _identity(state, name) not in seen:
             found[name] = name.split(".")[0]
-    return {name: one for name, one in found.items() if not name.startswith(targets or ("\0",))}
+    return {name: one for name, one in found.items() if not in_target(name, specs)}
 
 
 def _identity(state: Mapping[str, Any], name: str) -> tuple[str, bytes]:

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from sb3_sparse.errors import ConfigError, did_you_mean
-from sb3_sparse.policies.config import arguments_of
-from sb3_sparse.policies.named import import_path
+from sb3_sparse.policies.arguments import arguments_of, import_path
 from sb3_sparse.topology import method_named
 
 if TYPE_CHECKING:  # which is imported when settings are checked, not when names are read

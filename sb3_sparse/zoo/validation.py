@@ -13,8 +13,8 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from sb3_sparse.callback import SparsityCallback
 from sb3_sparse.engine.optimizers import check_weight_decay
 from sb3_sparse.errors import ConfigError, did_you_mean
+from sb3_sparse.policies.arguments import import_classes
 from sb3_sparse.policies.config import SPARSITY_MISSING, SparsityConfig
-from sb3_sparse.policies.named import import_named
 from sb3_sparse.topology import method_named
 from sb3_sparse.zoo.arguments import kind_of
 from sb3_sparse.zoo.settings import (
@@ -46,7 +46,7 @@ def check_settings(settings: Mapping[str, Any], algorithm: type[BaseAlgorithm]) 
     for part in (settings, kwargs, callback or {}, kwargs.get("optimizer_kwargs") or {}):
         for name, value in part.items():
             _check_value(algo.lower(), name, value)
-    import_named(dict(kwargs))
+    import_classes(dict(kwargs))
     if settings.get("noise_type") is not None and "noise_std" not in settings:
         raise ConfigError("noise_type needs noise_std, e.g. noise_std: 0.1")
     stored = issubclass(algorithm, OffPolicyAlgorithm)

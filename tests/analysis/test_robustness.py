@@ -115,9 +115,9 @@ def test_std_of_features_is_before_normalisation(tmp_path):
     normal = VecNormalize(noisy_vec_env("Pendulum-v1", 0.0, n_envs=4, std=[1.0] * 3))
     normal.obs_rms.var = np.full(3, 100.0)
     normal.save(str(tmp_path / "normal.pkl"))
-    with pytest.raises(ConfigError, match="still learns"):
+    with pytest.raises(ConfigError, match="still updates"):
         feature_std(model, normal, 400)
-    with pytest.raises(ConfigError, match="still learns"):
+    with pytest.raises(ConfigError, match="still updates"):
         noise_robustness(model, lambda _: normal, [0])
     normal.training = False
     first = noisy_vec_env("Pendulum-v1", 0.0, seed=3, std=[1.0] * 3).reset()

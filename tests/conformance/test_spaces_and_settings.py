@@ -170,7 +170,7 @@ def test_observations_that_sb3_cannot_preprocess_are_refused():
 
 @pytest.mark.parametrize(
     ("algorithm", "message"),
-    [("RecurrentPPO", "RecurrentPPO has no sparse policy"), ("ARS", "such as ARS, which has no")],
+    [("RecurrentPPO", "RecurrentPPO has no sparse policy"), ("ARS", "such as ARS, have no sparse")],
 )
 def test_an_algorithm_without_a_sparse_policy_says_so_for_the_class_too(algorithm, message):
     contrib = pytest.importorskip("sb3_contrib")

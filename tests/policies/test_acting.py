@@ -17,8 +17,8 @@ from torch import nn
 from torch.nn import functional
 
 from sb3_sparse import SparseActorCriticPolicy, SparseSACPolicy, SparsityCallback
-from sb3_sparse.policies.acting import Acts
-from sb3_sparse.policies.modes import Modes
+from sb3_sparse.policies.fast_predict import FastPredict
+from sb3_sparse.policies.training_mode import ModeSwitch
 
 COMPUTE = ("masked", "sparse")
 WIDE = dict(net_arch=[24, 24], sparsity=0.7)
@@ -268,7 +268,7 @@ def test_copies_and_pickles_act_as_the_policy_does(model):
     obs = observations(model, 2)
     expected, _ = model.predict(obs, deterministic=True)
     for twin in (copy.deepcopy(model.policy), pickle.loads(pickle.dumps(model.policy))):
-        assert isinstance(twin, Acts)
+        assert isinstance(twin, FastPredict)
         np.testing.assert_array_equal(twin.predict(obs, deterministic=True)[0], expected)
         with th.no_grad():
             for parameter in twin.parameters():
@@ -350,7 +350,7 @@ def test_a_hook_on_the_part_that_acts_is_run():
 
 def test_modules_that_come_later_are_switched_too():
     net = nn.Sequential(nn.Linear(2, 2), nn.Dropout())
-    modes = Modes()
+    modes = ModeSwitch()
 
     def set_mode(mode):
         net.train(mode)
@@ -369,7 +369,7 @@ def test_a_module_with_a_mode_of_its_own_keeps_it():
             return super().train(False)
 
     net = nn.Sequential(nn.Linear(2, 2), Frozen(2))
-    modes = Modes()
+    modes = ModeSwitch()
     for mode in (True, False, True):
         assert not modes.switch(net, net.train, mode)
         assert net.training is net[0].training is mode

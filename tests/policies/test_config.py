@@ -19,7 +19,10 @@ from sb3_sparse.policies.config import SparsityConfig
         (dict(sparsity=-0.1), "got -0.1"),
         (dict(sparsity="most"), "got 'most'"),
         (dict(sparsity={"actor": 0.5, "critic": 2}), "sparsity of 'critic' must lie"),
-        (dict(sparsity={"actor": 0.5, "critic": 0.5}, actor_share=0.5), "and actor_share as well"),
+        (
+            dict(sparsity={"actor": 0.5, "critic": 0.5}, actor_share=0.5),
+            "sparsity is given",
+        ),
         (dict(sparsity=0.9, initial_sparsity=1.5), "initial_sparsity must lie"),
         (dict(sparsity=0.9, distribution="flat"), "'flat'; allowed are er, erk, uniform"),
         (dict(sparsity=0.9, dense_layers="output"), r"must be a list of names.*got 'output'"),

@@ -84,7 +84,7 @@ def test_dense_layers_are_outside_the_budget_and_have_no_mask():
 
 
 def test_a_pattern_that_matches_nothing_lists_the_layers():
-    with pytest.raises(ConfigError, match=r"'actor.nu', which is no layer.*actor.mu.*'input'"):
+    with pytest.raises(ConfigError, match=r"'actor.nu', which matches no layer.*actor.mu.*'input'"):
         make("SAC", policy_kwargs=dict(dense_layers=["actor.nu"]))
 
 

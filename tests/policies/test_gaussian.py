@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from stable_baselines3.common.distributions import SquashedDiagGaussianDistribution
 from support import make
 
-from sb3_sparse.policies.gaussian import QuickSquashedGaussian
+from sb3_sparse.policies.gaussian_actor import FastSquashedGaussian
 
 
 @settings(max_examples=50, deadline=None)
@@ -27,7 +27,7 @@ def test_actions_log_probabilities_and_gradients_are_those_of_sb3(batch, dim, sc
     log_std = shift + 0.5 * th.randn(batch, dim, generator=random)
     weights = th.randn(batch, dim, generator=random), th.randn(batch, generator=random)
     found = []
-    for kind in (SquashedDiagGaussianDistribution, QuickSquashedGaussian):
+    for kind in (SquashedDiagGaussianDistribution, FastSquashedGaussian):
         # In double precision: SB3's formula cancels where ours does not.
         m, s = (t.double().requires_grad_() for t in (mean, log_std))
         th.manual_seed(seed)
@@ -42,18 +42,18 @@ def test_actions_log_probabilities_and_gradients_are_those_of_sb3(batch, dim, sc
 @pytest.mark.parametrize("name", ["SAC", "TQC", "CrossQ"])
 def test_sparse_actors_use_it_and_dense_ones_do_not(name):
     sparse, dense = make(name), make(name, policy_kwargs=dict(sparsity=0.0))
-    assert type(sparse.actor.action_dist) is QuickSquashedGaussian
+    assert type(sparse.actor.action_dist) is FastSquashedGaussian
     assert type(dense.actor.action_dist) is SquashedDiagGaussianDistribution
-    assert type(make(name, use_sde=True).actor.action_dist) is not QuickSquashedGaussian
+    assert type(make(name, use_sde=True).actor.action_dist) is not FastSquashedGaussian
     pruned = make(name, policy_kwargs=dict(initial_sparsity=0.0))
-    assert type(pruned.actor.action_dist) is QuickSquashedGaussian
+    assert type(pruned.actor.action_dist) is FastSquashedGaussian
 
 
 def test_thirty_updates_are_those_with_sb3s_distribution():
     found = []
-    for quick in (True, False):
+    for fast in (True, False):
         model = make("SAC")
-        if not quick:
+        if not fast:
             model.actor.action_dist = SquashedDiagGaussianDistribution(1)
         found.append(model.learn(50).policy.state_dict())
     for key, value in found[0].items():
@@ -61,7 +61,7 @@ def test_thirty_updates_are_those_with_sb3s_distribution():
 
 
 def test_what_is_not_a_number_is_reported_as_in_sb3():
-    distribution = QuickSquashedGaussian(2)
+    distribution = FastSquashedGaussian(2)
     with pytest.raises(ValueError, match="Expected parameter loc"):
         distribution.log_prob_from_params(th.full((3, 2), float("nan")), th.zeros(3, 2))
 
@@ -72,19 +72,19 @@ def test_a_model_can_be_copied_right_after_training():
 
 
 def test_the_distribution_is_that_of_the_last_observations():
-    distribution = QuickSquashedGaussian(2)
+    distribution = FastSquashedGaussian(2)
     distribution.log_prob_from_params(th.zeros(5, 2), th.zeros(5, 2))
     mean = th.full((3, 2), 0.5)
     distribution.log_prob_from_params(mean, th.zeros(3, 2))
     np.testing.assert_allclose(distribution.mode(), np.tanh(mean))
     assert distribution.sample().shape == (3, 2)
     with pytest.raises(AttributeError):
-        QuickSquashedGaussian(2).sample()
+        FastSquashedGaussian(2).sample()
 
 
 def test_second_derivatives_are_refused():
     mean = th.zeros(3, 2, requires_grad=True)
-    _, log_prob = QuickSquashedGaussian(2).log_prob_from_params(mean, th.zeros(3, 2))
+    _, log_prob = FastSquashedGaussian(2).log_prob_from_params(mean, th.zeros(3, 2))
     (first,) = th.autograd.grad(log_prob.sum(), mean, create_graph=True)
     with pytest.raises(RuntimeError, match="does not require grad|once_differentiable"):
         first.sum().backward()

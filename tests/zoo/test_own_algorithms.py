@@ -13,7 +13,7 @@ import yaml
 from sb3_sparse import SAC, SparseSACPolicy, register_policy, sparsify
 from sb3_sparse.analysis import flops
 from sb3_sparse.errors import ConfigError
-from sb3_sparse.export import export
+from sb3_sparse.export import export_policy
 from sb3_sparse.policies import registry
 from sb3_sparse.zoo.inspection import inspect_model
 from sb3_sparse.zoo.saved import find_saved
@@ -88,7 +88,7 @@ def test_its_gradient_step_is_counted(folder):
 def test_it_is_exported_and_a_sparser_twin_of_it_is_made(folder, tmp_path):
     model = find_saved(folder).load()
     for to in ("numpy", "c", "onnx"):
-        assert export(model, tmp_path / "policy", to).parity.holds
+        assert export_policy(model, tmp_path / "policy", to).parity.holds
     twin = sparsify(model, 0.9)
     assert type(twin) is type(model)
     assert twin.policy.sparse.sparsity > model.policy.sparse.sparsity

@@ -1,4 +1,4 @@
-"""Predictions of a few observations, as in a rollout: SB3's results with fewer steps on the way."""
+"""``predict`` for a few observations, as in a rollout: SB3's results in fewer steps."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from stable_baselines3.common.policies import BasePolicy
 
 from sb3_sparse.engine.boxes import CLIP, SCALE, UNSCALE, Bounds
 from sb3_sparse.engine.native.library import why_missing
-from sb3_sparse.policies.modes import SwitchesModes
-from sb3_sparse.policies.shortcut import untouched
+from sb3_sparse.policies.fast_forward import overrides
+from sb3_sparse.policies.training_mode import FastModeSwitch
 
 Actions = NDArray[Any]
-ON_THE_WAY = (
+BYPASSED = (
     "set_training_mode",
     "obs_to_tensor",
     "is_vectorized_observation",
@@ -25,11 +25,11 @@ ON_THE_WAY = (
     "_predict",
     "unscale_action",
 )
-"""What ``predict`` calls; a subclass of the user's own that has one of them gets SB3's."""
+"""Methods that SB3's ``predict`` calls. Where a user overrides one, SB3's ``predict`` runs."""
 
 
-class Acts(SwitchesModes, BasePolicy):
-    """A policy or part of one that predicts."""
+class FastPredict(FastModeSwitch, BasePolicy):
+    """A policy, or a module of one, that predicts in one call of the kernels where it can."""
 
     _bounds: Bounds | None = None
 
@@ -47,16 +47,16 @@ class Acts(SwitchesModes, BasePolicy):
         return actions, state
 
     def _predicted(self, observation: Any, deterministic: bool) -> Actions | None:
-        """Actions by the kernels; None where SB3 must say."""
-        if type(observation) is not np.ndarray or not untouched(self, ON_THE_WAY):
+        """Actions that the kernels compute; None: SB3 has to predict."""
+        if type(observation) is not np.ndarray or overrides(self, BYPASSED):
             return None
         alone = observation.shape == self.observation_space.shape
         if not alone and observation.shape[1:] != self.observation_space.shape:
             return None
-        acted = self._choose(observation[None] if alone else observation, deterministic)
+        acted = self._fast_actions(observation[None] if alone else observation, deterministic)
         if acted is None:
             return None
-        self._evaluate()
+        self._ensure_evaluation_mode()
         actions, space = acted, self.action_space
         if isinstance(space, spaces.Box):
             actions = acted.reshape((-1, *space.shape))
@@ -78,7 +78,7 @@ class Acts(SwitchesModes, BasePolicy):
         return super().unscale_action(scaled_action) if unscaled is None else unscaled
 
     def _in_box(self, actions: Actions, how: int) -> Actions | None:
-        """What :meth:`Bounds.of` gives; None where NumPy must say."""
+        """Actions moved by the kernels, see :meth:`Bounds.of`; None: NumPy has to compute them."""
         space, bounds = self.action_space, self._bounds
         if not isinstance(space, spaces.Box) or type(actions) is not np.ndarray:
             return None
@@ -89,8 +89,8 @@ class Acts(SwitchesModes, BasePolicy):
         return bounds.of(actions, how)
 
     @abstractmethod
-    def _choose(self, observations: Actions, deterministic: bool) -> Actions | None:
-        """Actions as the networks give them, by the kernels; None where modules must be called.
+    def _fast_actions(self, observations: Actions, deterministic: bool) -> Actions | None:
+        """Actions before scaling, computed by the kernels; None: the modules have to be called.
 
-        :param observations: shape ``(n, *shape of an observation)``, of any type
+        :param observations: shape ``(n, *shape of an observation)``, any dtype
         """

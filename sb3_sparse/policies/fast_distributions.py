@@ -1,4 +1,4 @@
-"""What SB3's distributions sample while acting, without the objects of ``torch.distributions``."""
+"""SB3's action distributions, without the objects of ``torch.distributions`` while acting."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from stable_baselines3.common.distributions import (
 from sb3_sparse.engine.gaussian import gaussian
 
 
-class MadeLater:
-    """Makes ``distribution`` when somebody asks for it, out of the last parameters."""
+class LazyDistribution:
+    """Makes the attribute ``distribution`` only when it is read, of the last parameters."""
 
     def remember(self, *parameters: th.Tensor) -> None:
-        """Be the distribution of these parameters of SB3's ``proba_distribution``."""
+        """Set the parameters, which are the arguments of SB3's ``proba_distribution``."""
         self._last = parameters
         vars(self).pop("distribution", None)
 
@@ -30,19 +30,18 @@ class MadeLater:
         return vars(self)["distribution"]
 
 
-class QuickGaussian(MadeLater, DiagGaussianDistribution):
-    """SB3's distribution for PPO and A2C with another :meth:`act`; everything else is SB3's."""
+class FastGaussian(LazyDistribution, DiagGaussianDistribution):
+    """SB3's Gaussian for PPO and A2C, with a faster way to :meth:`act`."""
 
     def act(
         self, mean: th.Tensor, log_std: th.Tensor, deterministic: bool
     ) -> tuple[th.Tensor, th.Tensor] | None:
-        """Actions and their log probabilities, shapes ``(n, dim)`` and ``(n,)``, without a graph.
-
-        They are those of SB3, of the same random numbers. None if a result is not finite,
-        or for a ``log_std`` that the kernels cannot read.
+        """The actions that SB3 samples from the same random numbers, without a graph.
 
         :param mean: shape ``(n, dim)``
         :param log_std: shape ``(dim,)``
+        :return: actions ``(n, dim)`` and their log probabilities ``(n,)``; None if one is not
+            finite, or for a ``log_std`` that the kernels cannot read
         """
         n, size = mean.shape
         if (
@@ -51,7 +50,7 @@ class QuickGaussian(MadeLater, DiagGaussianDistribution):
             or not log_std.is_cpu
             or not log_std.is_contiguous()
         ):
-            return None  # somebody has set another one, and torch knows what to do with it
+            return None  # the user has set another one, which torch can read
         noise = None if deterministic else th.randn((n, size), dtype=th.float32, device="cpu")
         acted = gaussian(mean, log_std, noise)
         if acted is not None:
@@ -59,13 +58,14 @@ class QuickGaussian(MadeLater, DiagGaussianDistribution):
         return acted
 
 
-class QuickCategorical(MadeLater, CategoricalDistribution):
-    """SB3's distribution for PPO and A2C with another :meth:`act`; everything else is SB3's."""
+class FastCategorical(LazyDistribution, CategoricalDistribution):
+    """SB3's categorical distribution for PPO and A2C, with a faster way to :meth:`act`."""
 
     def act(self, logits: th.Tensor, deterministic: bool) -> tuple[th.Tensor, th.Tensor] | None:
-        """Actions and their log probabilities, shapes ``(n,)``, without a graph.
+        """The actions that SB3 samples from the same random numbers, without a graph.
 
         :param logits: shape ``(n, actions)``
+        :return: actions and their log probabilities, shapes ``(n,)``
         """
         log_probs = logits.log_softmax(dim=1)
         probs = log_probs.exp()
@@ -77,10 +77,10 @@ class QuickCategorical(MadeLater, CategoricalDistribution):
         return actions.squeeze(1), log_probs.gather(1, actions).squeeze(1)
 
 
-def quick(distribution: Distribution) -> Distribution:
-    """A quick distribution in place of SB3's own; any other as it is."""
+def fast_distribution(distribution: Distribution) -> Distribution:
+    """A fast distribution in place of SB3's own; any other is returned as it is."""
     if type(distribution) is DiagGaussianDistribution:
-        return QuickGaussian(distribution.action_dim)
+        return FastGaussian(distribution.action_dim)
     if type(distribution) is CategoricalDistribution:
-        return QuickCategorical(distribution.action_dim)
+        return FastCategorical(distribution.action_dim)
     return distribution

@@ -1,8 +1,8 @@
-"""The squashed Gaussian of SAC's actor with fewer, larger steps.
+"""The squashed Gaussian of SAC's actor, as one node of the graph.
 
-Of a small actor's gradient step SB3's distribution is a tenth: some forty tiny operations, checks
-of arguments and nodes of the graph. Sampling and log probability in one node of the graph are the
-same function of the same random numbers, and its gradient in closed form is shorter still.
+SB3's distribution takes a tenth of a small actor's gradient step: some forty small operations with
+their checks. Here, one function samples and computes the log probability from the same random
+numbers, and its gradient has a closed form.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN
 from torch.autograd.function import once_differentiable
 
 from sb3_sparse.engine.gaussian import squashed
-from sb3_sparse.policies.acting import Actions
-from sb3_sparse.policies.parts import ActingPart
-from sb3_sparse.policies.sampling import MadeLater
+from sb3_sparse.policies.fast_distributions import LazyDistribution
+from sb3_sparse.policies.fast_predict import Actions
+from sb3_sparse.policies.modules import ActingModule
 
 LOG_OF_ROOT_OF_TWO_PI = 0.5 * math.log(2.0 * math.pi)
 
@@ -56,8 +56,8 @@ class _SampleAndLogProb(th.autograd.Function):
         return grad, grad * spread - grad_log_prob, None
 
 
-class QuickSquashedGaussian(MadeLater, SquashedDiagGaussianDistribution):
-    """SB3's distribution with another ``log_prob_from_params``, and :meth:`act`."""
+class FastSquashedGaussian(LazyDistribution, SquashedDiagGaussianDistribution):
+    """SB3's distribution with a faster ``log_prob_from_params``, and :meth:`act`."""
 
     def log_prob_from_params(
         self, mean_actions: th.Tensor, log_std: th.Tensor
@@ -66,16 +66,16 @@ class QuickSquashedGaussian(MadeLater, SquashedDiagGaussianDistribution):
         action, log_prob, self.gaussian_actions = _SampleAndLogProb.apply(  # type: ignore[no-untyped-call]
             mean_actions, log_std, self.epsilon
         )
-        if log_prob.isnan().any():  # SB3 says what is wrong
+        if log_prob.isnan().any():  # SB3's own raises the error
             return super().log_prob_from_params(mean_actions, log_std)
         self.remember(mean_actions, log_std)
         return action, log_prob
 
     def act(self, mean: th.Tensor, log_std: th.Tensor, deterministic: bool) -> th.Tensor | None:
-        """Actions, without a graph: those of SB3, of the same random numbers.
+        """The actions that SB3 samples from the same random numbers, without a graph.
 
         :param mean: shape ``(n, dim)``
-        :param log_std: the same shape; brought into SB3's bounds in place
+        :param log_std: the same shape; clamped to SB3's bounds in place
         :return: shape ``(n, dim)``; None if one is not finite
         """
         noise = None
@@ -89,22 +89,22 @@ class QuickSquashedGaussian(MadeLater, SquashedDiagGaussianDistribution):
         return actions
 
 
-class GaussianActor(ActingPart):
+class GaussianActor(ActingModule):
     """Actor of SAC, TQC and CrossQ."""
 
     paths = (("latent_pi", "mu"), ("latent_pi", "log_std"))
-    on_the_way = ("get_action_dist_params",)
+    bypassed = ("get_action_dist_params",)
     use_sde: bool
 
     def use_kernels(self) -> None:
-        """Act and sample with fewer steps from now on; gSDE stays SB3's."""
+        """Act and sample in fewer steps from now on; gSDE stays SB3's own."""
         if self.use_sde:
             return
         super().use_kernels()
         distribution = vars(self).get("action_dist")
         if type(distribution) is SquashedDiagGaussianDistribution:
-            quick = QuickSquashedGaussian(distribution.action_dim, distribution.epsilon)
-            vars(self)["action_dist"] = quick
+            fast = FastSquashedGaussian(distribution.action_dim, distribution.epsilon)
+            vars(self)["action_dist"] = fast
 
     def forward(self, obs: Any, deterministic: bool = False) -> th.Tensor:
         """As in SB3: actions of shape ``(n, dim)``."""
@@ -115,13 +115,13 @@ class GaussianActor(ActingPart):
         found: th.Tensor = super().forward(obs, deterministic)
         return found
 
-    def decide(self, results: list[Actions], deterministic: bool) -> Actions | None:
+    def actions_from(self, results: list[Actions], deterministic: bool) -> Actions | None:
         """Squashed actions, shape ``(n, dim)``."""
         actions = self._act(list(map(th.from_numpy, results)), deterministic)
         return None if actions is None else actions.numpy()
 
     def _act(self, results: list[th.Tensor], deterministic: bool) -> th.Tensor | None:
-        if not isinstance(self.action_dist, QuickSquashedGaussian):
+        if not isinstance(self.action_dist, FastSquashedGaussian):
             return None
         mean, log_std = results
         return self.action_dist.act(mean, log_std, deterministic)

@@ -1,4 +1,4 @@
-"""From observations to the results of networks, in one call of the kernels where it can be."""
+"""Forward passes of whole networks in one call of the kernels, where that is possible."""
 
 from __future__ import annotations
 
@@ -18,44 +18,44 @@ from sb3_sparse.engine.inference import MOST_INPUTS, Inference, by_modules
 from sb3_sparse.engine.kept import KeptInference
 from sb3_sparse.engine.masked import MaskedStorage
 from sb3_sparse.engine.paths import Paths
-from sb3_sparse.policies.storage import KNOWN
+from sb3_sparse.policies.storage import is_known
 
 PREDICTS = ("_predict", "forward")
-"""Methods of SB3's on the way from observations to actions."""
+"""Methods of SB3 that :meth:`FastForward.from_numpy` bypasses too."""
 
 
-class Shortcut:
-    """The way from observations to the results of networks, in one call where it can be.
+class FastForward:
+    """The forward pass of networks, from observations to outputs, in one call where possible.
 
-    :param paths: modules of each network, from the features to the result, by dotted names
-    :param on_the_way: methods of SB3's that it passes over, besides ``extract_features``; where
-        somebody has one of his own, modules are called one by one
+    Otherwise it returns None, and the modules have to be called one by one.
+
+    :param paths: dotted names of each network's modules, from the features to the output
+    :param bypassed: methods of SB3 that are not called then, besides ``extract_features``. Where
+        a user overrides one, the modules are called
     """
 
-    def __init__(
-        self, paths: tuple[tuple[str, ...], ...], on_the_way: tuple[str, ...] = ()
-    ) -> None:
+    def __init__(self, paths: tuple[tuple[str, ...], ...], bypassed: tuple[str, ...] = ()) -> None:
         self._paths = paths
-        self._on_the_way = ("extract_features", *on_the_way)
+        self._bypassed = ("extract_features", *bypassed)
         self._flat = False
         self._direct = False
         self._kept = KeptInference()
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> Shortcut:
-        return Shortcut(self._paths, self._on_the_way[1:])
+    def __deepcopy__(self, memo: dict[int, Any]) -> FastForward:
+        return FastForward(self._paths, self._bypassed[1:])
 
     def __reduce__(self) -> Any:
-        return Shortcut, (self._paths, self._on_the_way[1:])
+        return FastForward, (self._paths, self._bypassed[1:])
 
     def inference(self, root: BaseModel) -> Inference | None:
-        """What computes the networks at once; None where modules must be called one by one."""
+        """The compiled networks; None: the modules have to be called."""
         return self._kept.get(lambda: self._find(root))
 
     def _find(self, root: BaseModel) -> tuple[Paths, list[nn.Module]]:
-        # Whoever counted on the kernels goes by the modules if they know them no more.
+        # The kernels read masks; modules that they can no longer replace read the weights.
         for layer in MaskedStorage.below(root):
             layer.remask()
-        if not untouched(root, self._on_the_way):
+        if overrides(root, self._bypassed):
             return [], [root]
         paths = [[root.get_submodule(name) for name in path] for path in self._paths]
         around: list[nn.Module] = [root]
@@ -67,9 +67,9 @@ class Shortcut:
             module for module in root.children() if isinstance(module, BaseFeaturesExtractor)
         ]
         around = list({id(module): module for module in (*around, *extractors)}.values())
-        known = all(type(module).__module__.partition(".")[0] in KNOWN for module in around[1:])
+        known = all(is_known(type(module)) for module in around[1:])
         self._flat = takes_vectors(root) and all(map(only_flattens, extractors))
-        self._direct = self._flat and untouched(root, PREDICTS)
+        self._direct = self._flat and not overrides(root, PREDICTS)
         if self._flat:
             around += [module for extractor in extractors for module in extractor.children()]
         return paths if known else [], around
@@ -77,9 +77,9 @@ class Shortcut:
     def results(
         self, root: BaseModel, obs: Any, extractor: str = "features_extractor"
     ) -> list[th.Tensor] | None:
-        """Each network's result; None where modules must be called one by one.
+        """The output of each network; None: the modules have to be called.
 
-        :param root: the policy or part
+        :param root: the policy or module that has the networks
         :param obs: observations as SB3 hands them to ``forward``
         :param extractor: name of the features extractor that the networks share
         """
@@ -95,13 +95,13 @@ class Shortcut:
         features = BaseModel.extract_features(root, obs, getattr(root, extractor))
         return inference(features)
 
-    def of_array(
+    def from_numpy(
         self, root: BaseModel, observations: NDArray[Any]
     ) -> list[NDArray[np.float32]] | None:
-        """Each network's result; None where modules must be called one by one.
+        """The output of each network; None: the modules have to be called.
 
-        :param root: the policy or part, whose ``_predict`` and ``forward`` are passed over too
-        :param observations: shape ``(n, *shape of an observation)``, of any type
+        :param root: the policy or module; its ``_predict`` and ``forward`` are not called
+        :param observations: shape ``(n, *shape of an observation)``, any dtype
         """
         inference = self.inference(root)
         if inference is None or not self._direct or root._forward_hooks or root._forward_pre_hooks:
@@ -110,13 +110,13 @@ class Shortcut:
 
 
 def takes_vectors(root: BaseModel) -> bool:
-    """Whether observations are numbers that SB3 only makes float."""
+    """Whether observations are vectors, which SB3 only converts to float."""
     space = root.observation_space
     return isinstance(space, spaces.Box) and not is_image_space(space)
 
 
 def only_flattens(extractor: nn.Module) -> bool:
-    """Whether it does no more than SB3's own for vectors."""
+    """Whether a features extractor is SB3's own for vectors, unchanged."""
     flatten: Any = extractor._modules.get("flatten")
     return (
         type(extractor) is FlattenExtractor
@@ -125,13 +125,12 @@ def only_flattens(extractor: nn.Module) -> bool:
     )
 
 
-def untouched(module: nn.Module, names: tuple[str, ...]) -> bool:
-    """Whether neither it nor a subclass of the user's own has a method of these names."""
+def overrides(module: nn.Module, names: tuple[str, ...]) -> bool:
+    """Whether an object, or a user's subclass, has methods of its own under these names."""
     kind: Any = type(module)
-    return vars(module).keys().isdisjoint(names) and _untouched(kind, names)
+    return not vars(module).keys().isdisjoint(names) or _overrides(kind, names)
 
 
 @cache
-def _untouched(kind: Any, names: tuple[str, ...]) -> bool:
-    """Whether no subclass of the user's own has these methods."""
-    return all(getattr(kind, name).__module__.partition(".")[0] in KNOWN for name in names)
+def _overrides(kind: Any, names: tuple[str, ...]) -> bool:
+    return not all(is_known(getattr(kind, name)) for name in names)
