@@ -1,8 +1,7 @@
 """Sparse training for deep reinforcement learning, inside stock Stable-Baselines3.
 
-Importing the package registers ``SparsePolicy`` with every supported algorithm. The command line
-alone, which answers ``--help`` before anybody needs torch, leaves that to the first module that
-does.
+Importing the package registers ``SparsePolicy`` with every supported algorithm. Only the command
+line, which answers ``--help`` without torch, leaves that to the first module that needs it.
 """
 
 from __future__ import annotations
@@ -47,8 +46,8 @@ __all__ = [
     "SAC",
     "TD3",
     "BaseSparsePolicy",
-    "PassCounts",
     "NetworkSpec",
+    "PassCounts",
     "SparseActorCriticPolicy",
     "SparseDQNPolicy",
     "SparsePolicy",
@@ -67,8 +66,8 @@ __getattr__, __dir__ = lazily(
     {
         **{name: f"algorithms.{home}" for name, home in HOMES.items()},
         "BaseSparsePolicy": "policies.base",
-        "PassCounts": "policies.spec",
         "NetworkSpec": "policies.spec",
+        "PassCounts": "policies.spec",
         "SparseActorCriticPolicy": "policies.actor_critic",
         "SparseDQNPolicy": "policies.dqn",
         "SparseSACPolicy": "policies.sac",

@@ -21,7 +21,9 @@ from stable_baselines3 import DQN, SAC
 from support import arguments_of, assert_masked, make
 
 from sb3_sparse import SparsePolicy, cli
+from sb3_sparse.analysis import flops
 from sb3_sparse.export import export_policy
+from sb3_sparse.policies import registry as algorithms_registry
 from sb3_sparse.topology import registry
 from sb3_sparse.tuning import space_of
 from sb3_sparse.tuning.search import define
@@ -138,7 +140,7 @@ def test_the_sparse_model_of_the_documents_trains():
 
 
 def test_the_fused_model_of_the_documents_trains(capsys):
-    code, _ = python_blocks("docs/gradient_steps.md")
+    code, *_ = python_blocks("docs/gradient_steps.md")
     small = code.replace("1_000_000", "150").replace("HalfCheetah-v5", "Pendulum-v1")
     assert small.count("150") == small.count("Pendulum") == 1
     exec(compile(small, "docs/gradient_steps.md", "exec"), {})
@@ -166,7 +168,7 @@ class TorchCQL(DQN):
 
 
 def test_the_algorithm_of_the_documents_learns_what_it_says():
-    _, code = python_blocks("docs/gradient_steps.md")
+    code = python_blocks("docs/gradient_steps.md")[1]
     names: dict[str, Any] = {}
     exec(compile(code, "docs/gradient_steps.md", "exec"), names)
     own, expected, plain = (
@@ -179,6 +181,19 @@ def test_the_algorithm_of_the_documents_learns_what_it_says():
         th.testing.assert_close(value, weights[key], rtol=1e-4, atol=1e-6)
     layer = "q_net.q_net.0.weight"
     assert not th.allclose(plain.policy.state_dict()[layer], weights[layer], rtol=1e-4)
+
+
+def test_the_registered_algorithm_of_the_documents_is_counted():
+    code = python_blocks("docs/gradient_steps.md")[2]
+    names: dict[str, Any] = {"__name__": "docs"}
+    try:
+        exec(compile(code, "docs/gradient_steps.md", "exec"), names)
+        model = make(names["MySAC"], "Pendulum-v1", **arguments_of(names["MySAC"]))
+        assert isinstance(model.policy, names["MySACPolicy"])
+        assert flops(model).step() == flops(make("SAC")).step()
+        assert [(p.forward, p.backward) for p in names["passes"](model)][0] == (2, 1)
+    finally:
+        algorithms_registry._registered.pop("MySAC", None)
 
 
 def test_the_measures_of_the_documents_run(tmp_path, monkeypatch, capsys):

@@ -40,7 +40,7 @@ Env = Annotated[str, option("Gymnasium environment id, or package:Id.")]
 GymPackages = Annotated[
     list[str] | None,
     option(
-        "Module that registers environments of your own; may be given again.",
+        "Module that registers environments or algorithms of yours; may be given again.",
         "--gym-packages",
         shown=False,
     ),
