@@ -1,4 +1,4 @@
-"""Reports on runs: figures, tables and verdicts, out of run folders alone."""
+"""Reports on runs: figures, tables and verdicts, read from run folders."""
 
 from sb3_sparse.report.data import LeftOut, RunData, read_runs
 from sb3_sparse.report.figures import FIGURES

@@ -1,4 +1,4 @@
-"""The one door to rliable and matplotlib."""
+"""rliable and matplotlib, optional dependencies: every module imports them from here."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files of measurements beside a run's evaluations: signal-to-noise ratios, noise, plasticity."""
+"""Files of measurements in a run's folder: signal-to-noise ratios, noise, plasticity."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ CURE = "remove it, or measure anew"
 
 
 def measured_text(path: Path) -> str:
-    """Text of a file of measurements.
+    """Read the text of a file of measurements.
 
-    :raises CorruptStateError: if it is no text
+    :raises CorruptStateError: if it is not text
     """
     return read_text(path, WHAT, CURE)
 
 
 def rows_of(text: str, path: Path, columns: Sequence[str]) -> Rows:
-    """Rows of a CSV text that has at least these columns.
+    """Parse the rows of a CSV text that has at least these columns.
 
-    :param path: of the file that it is of, for messages
-    :raises ConfigError: if a column is missing, or a cell is no number
-    :raises CorruptStateError: if it is no table
+    :param path: of the text's file, for messages
+    :raises ConfigError: if a column is missing, or a cell is not a number
+    :raises CorruptStateError: if it is not a table
     """
     with reading(path, WHAT, CURE):
         reader = csv.DictReader(io.StringIO(text, newline=""))

@@ -1,4 +1,4 @@
-"""Scores on one scale over tasks: what is 0, what is 1, and where that is from."""
+"""Scores on one scale over tasks: which score becomes 0, which becomes 1, and by what source."""
 
 from __future__ import annotations
 
@@ -45,11 +45,11 @@ PAIRS = {
 
 @dataclass(frozen=True)
 class Scale:
-    """Of one task.
+    """The scale of a task.
 
-    :param zero: score that becomes 0
-    :param one: score that becomes 1
-    :param source: where they are from
+    :param zero: the score that becomes 0
+    :param one: the score that becomes 1
+    :param source: where the two are from
     """
 
     zero: float
@@ -61,9 +61,9 @@ class Scale:
 
 
 class Normaliser:
-    """A scale for each family and task that has one.
+    """The scales of all families and tasks that have one.
 
-    :param runs: of which the dense ones of full size give the scale where none is fixed
+    :param runs: where no scale is fixed, the dense runs of full size among them give it
     """
 
     def __init__(self, runs: Iterable[RunData]) -> None:
@@ -79,12 +79,12 @@ class Normaliser:
                 self.missing.append(f"{family}, {env_id}: {scale}")
 
     def __call__(self, run: RunData, score: float | None = None) -> float | None:
-        """A run's score, or another return of its task, normalised; None without a scale."""
+        """Normalise a run's score, or another return of its task; None without a scale."""
         scale = self.scales.get((run.family, run.env_id))
         return None if scale is None else scale(run.score if score is None else score)
 
     def statements(self) -> list[str]:
-        """What 0 and 1 stand for, a line a task."""
+        """Return a line for each task that tells what 0 and 1 stand for."""
         return [
             f"{family}, {env_id}: 0 is {scale.zero:.6g}, 1 is {scale.one:.6g} ({scale.source})"
             for (family, env_id), scale in self.scales.items()

@@ -1,4 +1,4 @@
-"""What stands on a report's page, in order."""
+"""The page of a report, section by section."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ INTERVALS = (
 
 @dataclass(frozen=True)
 class Shown:
-    """One figure of the page.
+    """A figure of the page.
 
-    :param name: in the table of figures
-    :param svg: None if it was left out
-    :param remarks: why it was, or what is not in it
+    :param name: of the figure
+    :param svg: the drawing; None if the figure was left out
+    :param remarks: why it was left out, or what is missing in it
     """
 
     name: str
@@ -51,7 +51,7 @@ class Shown:
 
 @dataclass(frozen=True)
 class Content:
-    """All that the page says."""
+    """The content of the page."""
 
     title: str
     results: Results
@@ -64,17 +64,17 @@ class Content:
 
     @property
     def diverged(self) -> list[LeftOut]:
-        """Runs whose training ended in NaN."""
+        """The runs whose training ended in NaN."""
         return [one for one in self.left_out if one.diverged]
 
     @property
     def others(self) -> list[LeftOut]:
-        """What else is not in the report."""
+        """Everything else that the report leaves out."""
         return [one for one in self.left_out if not one.diverged]
 
 
 def render(content: Content) -> str:
-    """The page's HTML."""
+    """Return the page's HTML."""
     results = content.results
     parts = [
         html.paragraph(_counts(content)),

@@ -1,4 +1,4 @@
-"""All runs of a report, and which of them methods are compared by."""
+"""The runs of a report, and which of them compare methods."""
 
 from __future__ import annotations
 
@@ -22,10 +22,19 @@ class NotEnoughData(SparsityError):
 
 @dataclass(frozen=True)
 class Results:
-    """Runs with what is derived of them.
+    """The runs of a report, grouped, and with their scores on one scale.
 
-    :param runs: all that were read
-    :param varies: name of the setting that was varied, for the figure of sensitivity
+    :param runs: as :func:`read_runs` returns them
+    :param varies: name of the setting that was varied, for the figure ``"sensitivity"``
+
+    Example::
+
+        from sb3_sparse.report import Results, judge, read_runs
+
+        runs, left_out = read_runs(["logs/dqn/CartPole-v1_1", "logs/dqn/CartPole-v1_2"])
+        results = Results(tuple(runs))
+        for verdict in judge(results):
+            print(verdict.finding.text, verdict.verdict, verdict.remark)
     """
 
     runs: tuple[RunData, ...]
@@ -33,7 +42,7 @@ class Results:
 
     @cached_property
     def trained(self) -> list[RunData]:
-        """All that were trained, whatever their settings."""
+        """All runs that were trained, with any settings."""
         return [run for run in self.runs if run.trained]
 
     @cached_property
@@ -42,33 +51,33 @@ class Results:
 
     @property
     def main(self) -> list[RunData]:
-        """The runs that methods are compared by: one variant of settings for each cell."""
+        """The runs that compare methods: one variant of settings for each cell."""
         return self._chosen[0]
 
     @property
     def remarks(self) -> list[str]:
-        """Which variants of settings are not among them."""
+        """Remarks on the variants of settings that are not among them."""
         return self._chosen[1]
 
     @cached_property
     def normaliser(self) -> Normaliser:
-        """Built of the main runs, so that another variant's dense runs set no scale."""
+        """The scales, which only the dense runs among the main runs can set."""
         return Normaliser(self.main)
 
     def families(self) -> list[str]:
-        """Algorithm, architecture and suite of all trained runs."""
+        """Return the families (algorithm, architecture and suite) of the trained runs."""
         return sorted({run.family for run in self.trained})
 
     def levels(self, family: str) -> list[float]:
-        """Sparsities at which methods are compared, rising."""
+        """Return the sparsities at which methods are compared, ascending."""
         return sorted({r.level for r in self.main if r.family == family and r.label != DENSE})
 
     def envs(self, family: str) -> list[str]:
-        """Tasks."""
+        """Return the tasks of a family."""
         return sorted({run.env_id for run in self.trained if run.family == family})
 
     def labels(self, family: str, level: float | None = None) -> list[str]:
-        """Methods at a sparsity or at any; the dense network of full size belongs to each."""
+        """Return the methods at a sparsity, or at any; dense of full size belongs to each."""
         return in_order(
             {
                 run.label
@@ -78,7 +87,7 @@ class Results:
         )
 
     def cell(self, family: str, env_id: str, label: str, level: float) -> list[RunData]:
-        """Runs to be averaged, by rising seed."""
+        """Return the runs to average, by ascending seed."""
         level = 0.0 if label == DENSE else level
         return self._cells.get((family, env_id, label, level), [])
 
@@ -87,17 +96,17 @@ class Results:
         return grouped(self.main, cell_of)
 
     def setting(self, run: RunData, name: str) -> object:
-        """A setting's value in a run, or its default."""
+        """Return a setting's value in a run, or its default."""
         return setting_of(run.algo, run.settings, name)
 
 
 def cell_of(run: RunData) -> Cell:
-    """What runs that differ in nothing but settings and seed have in common."""
+    """Return what runs that differ only in settings and seed have in common."""
     return run.family, run.env_id, run.label, run.level
 
 
 def grouped(runs: Iterable[RunData], key: Callable[[RunData], Cell]) -> dict[Cell, list[RunData]]:
-    """Runs by a key, by rising seed."""
+    """Group runs by a key, in ascending order of seeds."""
     found: dict[Cell, list[RunData]] = defaultdict(list)
     for run in sorted(runs, key=lambda run: run.seed):
         found[key(run)].append(run)
@@ -105,12 +114,12 @@ def grouped(runs: Iterable[RunData], key: Callable[[RunData], Cell]) -> dict[Cel
 
 
 def choose(runs: Sequence[RunData]) -> tuple[list[RunData], list[str]]:
-    """One variant of settings for each cell, so that no two settings are averaged.
+    """Choose one variant of settings for each cell, so that no two settings are averaged.
 
-    That whose runs change the fewest settings of their config; among these that with most seeds;
-    then the first in the order of their text.
+    It chooses the variant that changes the fewest settings of its config; among equals the one with
+    the most seeds; then the first in the order of their texts.
 
-    :return: its runs, and a remark for each cell that has other variants
+    :return: the runs of the chosen variants, and a remark for each cell that has others
     """
     main: list[RunData] = []
     remarks = []

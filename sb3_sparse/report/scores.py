@@ -1,4 +1,4 @@
-"""Normalised scores of methods over the same tasks, as a panel compares them."""
+"""Normalised scores of methods over the same tasks, one panel for each sparsity."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Interquartile means, probabilities of improvement and profiles by rliable; intervals of means.
 
-All intervals are called 95 %. What they cover of the truth, measured on 2,000 data sets of normal
-scores, each method with as many seeds:
+All intervals are nominally at 95 %. How often they cover the truth was measured on 2,000 data sets
+of normal scores, with the same number of seeds for each method:
 
 ======  =====  ==================  =============  ==========================
 tasks   seeds  IQM (iqm_estimates)  plain difference  widened (difference)
@@ -14,7 +14,7 @@ tasks   seeds  IQM (iqm_estimates)  plain difference  widened (difference)
 5       10     0.92                0.93           0.95
 ======  =====  ==================  =============  ==========================
 
-So verdicts rest on the widened one; the intervals of IQM figures are rliable's own, as published
+So verdicts use the widened interval. The intervals of IQM figures are rliable's own, as published
 work draws them, and too narrow for few seeds.
 """
 
@@ -38,10 +38,10 @@ class Estimate:
     """A number with its 95 % interval.
 
     :param value: point estimate
-    :param low: lower end; nan where there are not enough data for an interval
+    :param low: lower end; nan if there are too few data for an interval
     :param high: upper end
     :param seeds: runs of each task
-    :param tasks: tasks
+    :param tasks: number of tasks
     """
 
     value: float
@@ -53,11 +53,11 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Rectangle:
-    """Scores as rliable wants them: as many runs of each task.
+    """Scores as rliable expects them, with the same number of runs for each task.
 
     :param scores: shape ``[runs, tasks]``
     :param tasks: names of the columns
-    :param remarks: what had to be left out for it
+    :param remarks: what was left out
     """
 
     scores: Array
@@ -66,10 +66,11 @@ class Rectangle:
 
 
 def rectangle(by_task: Mapping[str, Sequence[float]], least: int = LEAST) -> Rectangle | None:
-    """The first k scores of each task, k being the smallest number of runs over tasks.
+    """Take the first k scores of each task, where k is the smallest number of runs of a task.
 
-    :param by_task: scores of each task in the order of seeds, so that no score decides
-    :param least: a task with fewer runs is left out, and named
+    :param by_task: scores of each task in the order of seeds, so that the choice does not depend on
+        scores
+    :param least: a task with fewer runs is left out, with a remark
     :return: None if no task is left
     """
     full = {task: scores for task, scores in by_task.items() if len(scores) >= least}
@@ -90,14 +91,17 @@ def rectangle(by_task: Mapping[str, Sequence[float]], least: int = LEAST) -> Rec
 
 
 def iqm(scores: Array) -> float:
-    """Mean of the middle half of all scores, shape ``[runs, tasks]``; as rliable's."""
+    """Return the mean of the middle half of all scores, as rliable does.
+
+    :param scores: shape ``[runs, tasks]``
+    """
     ordered = np.sort(scores, axis=None)
     cut = ordered.size // 4
     return float(ordered[cut : ordered.size - cut].mean())
 
 
 def iqm_estimates(scores: Mapping[str, Array], reps: int = REPS) -> dict[str, Estimate]:
-    """Interquartile means with stratified bootstrap intervals.
+    """Return interquartile means with stratified bootstrap intervals, by method.
 
     :param scores: shape ``[runs, tasks]`` by method; two runs or more
     """
@@ -107,7 +111,9 @@ def iqm_estimates(scores: Mapping[str, Array], reps: int = REPS) -> dict[str, Es
 
 
 def improvement(better: Array, worse: Array, reps: int = REPS) -> Estimate:
-    """Probability that a run of one method beats one of another, mean over tasks; ties count half.
+    """Return the probability that a run of one method beats a run of another.
+
+    It is the mean over tasks; ties count half.
 
     :param better: shape ``[runs, tasks]``
     :param worse: shape ``[runs, tasks]``, the same tasks
@@ -121,7 +127,7 @@ def improvement(better: Array, worse: Array, reps: int = REPS) -> Estimate:
 
 
 def profile(scores: Array, taus: Array, reps: int = REPS) -> tuple[Array, Array, Array]:
-    """Share of runs with a score above each threshold, and the ends of its interval.
+    """Return the share of runs with a score above each threshold, and the ends of its interval.
 
     :param scores: shape ``[runs, tasks]``
     :param taus: shape ``[n]``
@@ -136,15 +142,15 @@ def profile(scores: Array, taus: Array, reps: int = REPS) -> tuple[Array, Array,
 def difference(
     x: Array, y: Array, statistic: Callable[[Array], float] = iqm, reps: int = REPS
 ) -> Estimate:
-    """By how much a method's statistic exceeds another's; the interval holds for few seeds.
+    """Return by how much a method's statistic exceeds another's, with an interval for few seeds.
 
-    The stratified bootstrap draws from n runs as if they were all there are, so its interval is too
-    narrow by sqrt((n - 1)/n), and normal where Student's t is due. Both ends are moved out by these
-    factors. Source: Hesterberg 2015 (arXiv:1411.5279), section 3.2, applied to the ends themselves,
-    because with 3 runs the tails of the bootstrap are too coarse to read wider quantiles off.
+    The stratified bootstrap draws from n runs as if there were no others, so its interval is too
+    narrow by sqrt((n - 1)/n), and it is normal where Student's t is due. Both ends are moved out by
+    these factors. Source: Hesterberg 2015 (arXiv:1411.5279), section 3.2, applied to the ends
+    themselves, because with 3 runs the tails of the bootstrap are too coarse for wider quantiles.
 
     :param x: shape ``[runs, tasks]``
-    :param y: shape ``[runs of its own, the same tasks]``
+    :param y: shape ``[other runs, tasks]``, the same tasks
     """
 
     def subtract(a: Array, b: Array) -> Array:
@@ -160,7 +166,7 @@ def difference(
 
 
 def mean(values: Sequence[float]) -> Estimate:
-    """Mean over seeds with Student's t interval, which is right for few seeds; none for one."""
+    """Return the mean over seeds with Student's t interval; the ends are nan for a single seed."""
     middle, low, high = map(float, mean_interval(values))
     return Estimate(middle, low, high, len(values))
 
@@ -168,9 +174,9 @@ def mean(values: Sequence[float]) -> Estimate:
 def means_at(
     seeds: Sequence[Mapping[float, float]],
 ) -> tuple[list[float], tuple[Array, Array, Array]]:
-    """The same of curves, at the points that all of them have.
+    """Return the mean of curves at the points that all of them have.
 
-    :param seeds: value by point, a curve a seed
+    :param seeds: a curve per seed, as values by point
     :return: the points in order, and the mean there with the ends of its interval
     """
     points = sorted(set.intersection(*(set(curve) for curve in seeds)))
@@ -195,7 +201,7 @@ def _bootstrap(
 
 @contextmanager
 def _seeded() -> Iterator[None]:
-    """NumPy's global generator from a fixed seed, as it was afterwards.
+    """Seed NumPy's global generator within the block, and restore it afterwards.
 
     rliable 1.2 takes a ``random_state`` but draws from the global generator.
     """

@@ -1,4 +1,4 @@
-"""What the paper found, held against these runs: each finding's rule, effect, interval and n."""
+"""The paper's findings tested on runs, each by a written rule."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ NO_LOSS, SAME = 0.05, 0.1
 
 @dataclass(frozen=True)
 class Finding:
-    """A sentence of the paper and how it is tested.
+    """A finding of the paper, and how it is tested.
 
     :param key: its name
-    :param text: what the paper found
-    :param rule: what is compared, and when it counts as supported or contradicted
-    :param sides: gives the scores of both sides by stratum
-    :param decide: ``"greater"``, ``"less"``, ``"no loss"`` or ``"same"``
-    :param statistic: of which the difference is taken
+    :param text: the finding
+    :param rule: what is compared
+    :param sides: returns the scores of both sides by stratum
+    :param decide: how the interval decides; a key of ``DECIDED``
+    :param statistic: the difference of this statistic is the effect
     :param unit: of the effect
     """
 
@@ -49,16 +49,24 @@ class Finding:
 
 @dataclass(frozen=True)
 class Verdict:
-    """On one finding, for one family of runs.
+    """The verdict of one family of runs on a finding.
 
+    :param finding: the finding
     :param family: algorithm, architecture and suite; empty if no family has data
     :param verdict: supported, contradicted or not enough data
-    :param effect: difference; None if it could not be taken
+    :param effect: the difference of the two sides; None if there is none
     :param low: lower end of its 95 % interval
     :param high: upper end
     :param seeds: runs of each stratum, on the scarcer side
-    :param strata: how many
+    :param strata: number of strata
     :param remark: why there is no verdict, or what it leaves out
+
+    Example::
+
+        from sb3_sparse.report import Results, judge
+
+        for verdict in judge(Results(())):  # no runs, so there are no data on any finding
+            print(verdict.finding.key, verdict.verdict, verdict.remark)
     """
 
     finding: Finding

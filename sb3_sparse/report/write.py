@@ -1,4 +1,4 @@
-"""Write a report: one page, its figures, and the numbers behind them."""
+"""Write a report: a page, its figures, and the numbers behind them."""
 
 from __future__ import annotations
 
@@ -32,20 +32,20 @@ def write_report(
     """Write a report on run folders and archived runs.
 
     It makes ``index.html``, which opens from disk without a network, ``cells.csv``, ``runs.csv``,
-    ``verdicts.csv``, and ``figures/<name>`` as PNG, SVG and CSV. A figure that these
-    runs do not give stays as an earlier report in ``out`` has drawn it, or is left out; the page
-    says why. The same runs give the same bytes.
+    ``verdicts.csv``, and ``figures/<name>`` as PNG, SVG and CSV. A figure that cannot be drawn from
+    these runs stays as an earlier report in ``out`` drew it, or is left out; the page tells why.
+    The same runs give the same bytes.
 
-    :param folders: of runs; what cannot be used is named on the page
+    :param folders: of runs; the page names those that cannot be used
     :param out: folder to write to
     :param title: of the page
     :param figures: names of the figures, in order
     :param varies: setting that was varied, for the figure ``"sensitivity"``
-    :param command: continues what is pending
+    :param command: the command that continues what is pending
     :param pending: cells that are planned and not done
-    :param archived: runs by the folder that they have or had, as of :func:`read_runs`
+    :param archived: runs by the folder that they have or had, as in :func:`read_runs`
     :return: the page
-    :raises ConfigError: for an unknown figure, or an ``out`` that is no folder
+    :raises ConfigError: for an unknown figure, or if ``out`` is not a folder
     """
     check_figures(figures)
     out = Path(out)
@@ -77,7 +77,7 @@ def _figure(name: str, results: Results, folder: Path) -> Shown:
 
 
 def _kept(name: str, folder: Path, why_not: str) -> Shown:
-    """A figure that an earlier report has drawn, e.g. where the models still were; it stays."""
+    """Keep the figure of an earlier report, drawn e.g. where the models were; else leave it out."""
     drawn = folder / f"{name}.svg"
     if not drawn.is_file():
         return Shown(name, None, [why_not])

@@ -1,4 +1,4 @@
-"""One file a figure; importing this package enters them all into the table."""
+"""The figures, one per file; importing this package registers them all."""
 
 from sb3_sparse.report.figures import (  # noqa: F401
     aggregate,

@@ -1,10 +1,8 @@
-"""Interquartile mean of each method."""
+"""The interquartile mean of each method."""
 
 from __future__ import annotations
 
-from typing import Any
-
-from sb3_sparse.report.figures.base import Drawing, figure, panels
+from sb3_sparse.report.figures.base import Drawing, Sheet, figure
 from sb3_sparse.report.methods import look_of, name_of
 from sb3_sparse.report.results import Results
 from sb3_sparse.report.scores import panels_of
@@ -20,11 +18,10 @@ HEADS = ("family", "sparsity", "method", "iqm", "low", "high", "seeds", "tasks")
     "bootstrap intervals (rliable); a panel for each sparsity.",
 )
 def draw(results: Results) -> Drawing:
-    """A panel a sparsity, an interval a method."""
+    """Draw a panel for each sparsity, with an interval for each method."""
     found, remarks = panels_of(results)
-    made, axes = panels(len(found))
-    rows: list[list[Any]] = []
-    for one, panel in zip(axes, found, strict=True):
+    sheet = Sheet(HEADS, len(found))
+    for one, panel in zip(sheet.axes, found, strict=True):
         estimates = iqm_estimates(panel.scores)
         for place, (label, estimate) in enumerate(estimates.items()):
             look = look_of(label)
@@ -33,12 +30,10 @@ def draw(results: Results) -> Drawing:
                      solid_capstyle="butt")  # fmt: skip
             one.plot(estimate.value, place, look.marker, color=look.color, markersize=7)
             low, high, value = estimate.low, estimate.high, estimate.value
-            rows.append(
-                [panel.family, panel.level, label, value, low, high, estimate.seeds, estimate.tasks]
-            )
+            row = [panel.family, panel.level, label, value, low, high]
+            sheet.rows.append([*row, estimate.seeds, estimate.tasks])
         one.set_yticks(range(len(estimates)), [name_of(label) for label in estimates])
         one.invert_yaxis()
         one.margins(x=0.08, y=0.12)
-        one.set_title(panel.title)
-        one.set_xlabel("IQM of normalised scores")
-    return Drawing(made, HEADS, rows, remarks)
+        one.set(title=panel.title, xlabel="IQM of normalised scores")
+    return sheet.drawing(remarks)

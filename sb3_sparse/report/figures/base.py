@@ -1,8 +1,8 @@
-"""What a figure is, the table of all figures, and how one is written."""
+"""Figures: their registry, their style, and how they are written."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
@@ -49,10 +49,10 @@ STYLE: Any = {
 class Drawing:
     """A figure with the numbers behind it.
 
-    :param figure: drawn
+    :param figure: the drawing
     :param heads: columns of its CSV
-    :param rows: its numbers
-    :param remarks: what is not in it
+    :param rows: the numbers
+    :param remarks: what is missing in it
     """
 
     figure: Figure
@@ -67,11 +67,11 @@ DrawT = TypeVar("DrawT", bound=Draw)
 
 @dataclass(frozen=True)
 class Entry:
-    """A figure's place in the table.
+    """A registered figure.
 
     :param title: its heading
     :param caption: what it shows
-    :param draw: draws it
+    :param draw: the function that draws it
     """
 
     title: str
@@ -83,7 +83,7 @@ FIGURES: dict[str, Entry] = {}
 
 
 def figure(name: str, title: str, caption: str) -> Callable[[DrawT], DrawT]:
-    """Enter a figure into the table."""
+    """Register the function that draws a figure."""
 
     def enter(draw: DrawT) -> DrawT:
         FIGURES[name] = Entry(title, caption, draw)
@@ -93,9 +93,9 @@ def figure(name: str, title: str, caption: str) -> Callable[[DrawT], DrawT]:
 
 
 def check_figures(names: Sequence[str]) -> None:
-    """Raise for a name that no figure has.
+    """Check names of figures.
 
-    :raises ConfigError: and list what is allowed
+    :raises ConfigError: for an unknown name; lists those that are allowed
     """
     unknown = [name for name in names if name not in FIGURES]
     if unknown:
@@ -104,22 +104,96 @@ def check_figures(names: Sequence[str]) -> None:
         )
 
 
-def panels(count: int, columns: int = COLUMNS, height: float = HEIGHT) -> tuple[Figure, list[Axes]]:
-    """Axes in rows, as many as are asked for."""
-    columns = min(columns, count)
-    rows = -(-count // columns)
-    made = Figure(figsize=(max(WIDTH * columns, 4.6), height * rows + 0.5), layout="constrained")
-    grid = made.subplots(rows, columns, squeeze=False)
-    axes = list(grid.flat)
-    for spare in axes[count:]:
-        spare.remove()
-    return made, axes[:count]
+class Sheet:
+    """Panels in rows, and the numbers that are drawn in them.
+
+    :param heads: columns of the numbers; those of lines end in x, value, low, high and seeds
+    :param count: number of panels
+    :param columns: panels in a row
+    :param height: of a row, in inches
+    """
+
+    def __init__(
+        self, heads: Sequence[str], count: int, columns: int = COLUMNS, height: float = HEIGHT
+    ) -> None:
+        columns = min(columns, count)
+        rows = -(-count // columns)
+        size = (max(WIDTH * columns, 4.6), height * rows + 0.5)
+        self.figure = Figure(figsize=size, layout="constrained")
+        axes = list(self.figure.subplots(rows, columns, squeeze=False).flat)
+        for spare in axes[count:]:
+            spare.remove()
+        self.axes: list[Axes] = axes[:count]
+        self.heads, self.rows = heads, list[Sequence[Any]]()
+
+    def line(
+        self,
+        axes: Axes,
+        place: Sequence[Any],
+        x: Sequence[float],
+        ends: tuple[Array, Array, Array],
+        counts: Sequence[int],
+        look: Look,
+        label: str,
+    ) -> None:
+        """Draw a line as :func:`line` does, and add its rows.
+
+        :param place: what begins each of the rows
+        :param ends: mean, and lower and upper end of the interval, each of the shape of ``x``
+        :param counts: what ends each of the rows: the seeds, and the tasks if there are several
+        """
+        for at, *values in zip(x, *ends, strict=True):
+            self.rows.append([*place, at, *map(float, values), *counts])
+        line(axes, x, ends, look, label)
+
+    def estimates(
+        self,
+        axes: Axes,
+        place: Sequence[Any],
+        estimates: Mapping[Any, Estimate],
+        x: Sequence[float],
+        look: Look,
+        label: str,
+    ) -> None:
+        """Draw estimates as a line, and add their rows.
+
+        :param estimates: by the value that stands for ``x`` in their rows
+        """
+        self.note(place, estimates)
+        line(axes, x, ends_of(estimates.values()), look, label)
+
+    def note(self, place: Sequence[Any], estimates: Mapping[Any, Estimate]) -> None:
+        """Add the rows of estimates."""
+        for at, e in estimates.items():
+            self.rows.append([*place, at, e.value, e.low, e.high, e.seeds])
+
+    def drawing(self, remarks: Sequence[str] = ()) -> Drawing:
+        """Finish the figure with one legend below all panels, and panels as high as their lines."""
+        found: dict[str, Any] = {}
+        for one in self.axes:
+            _limit(one)
+            for handle, label in zip(*one.get_legend_handles_labels(), strict=True):
+                found.setdefault(label, handle)
+        if found:
+            entry = ENTRY + LETTER * max(map(len, found))
+            columns = max(1, int(self.figure.get_figwidth() / entry))
+            self.figure.legend(
+                list(found.values()), list(found), loc="outside lower center",
+                ncols=min(columns, len(found)),
+            )  # fmt: skip
+        return Drawing(self.figure, self.heads, self.rows, remarks)
+
+
+def ends_of(estimates: Iterable[Estimate]) -> tuple[Array, Array, Array]:
+    """Return the values of estimates, and the lower and upper ends of their intervals."""
+    values, low, high = np.array([(e.value, e.low, e.high) for e in estimates]).T
+    return values, low, high
 
 
 def line(
     axes: Axes, x: Sequence[float], ends: tuple[Array, Array, Array], look: Look, label: str
 ) -> None:
-    """A mean with its interval as a band; the band is left out where there is no interval."""
+    """Draw a mean with its interval as a band, or without a band if there is no interval."""
     middle, low, high = ends
     every = max(1, len(x) // 8)
     axes.plot(
@@ -130,44 +204,8 @@ def line(
         axes.fill_between(x, low, high, color=look.color, alpha=0.15, linewidth=0)
 
 
-def estimates_line(
-    axes: Axes, x: Sequence[float], estimates: Sequence[Estimate], look: Look, label: str
-) -> None:
-    """The same of estimates."""
-    middle, low, high = (
-        np.array([getattr(estimate, end) for estimate in estimates])
-        for end in ("value", "low", "high")
-    )
-    line(axes, x, (middle, low, high), look, label)
-
-
-def logarithmic(one: Axes, which: str) -> None:
-    """A logarithmic axis that is legible over less than a decade, too: 500, 1k, 2k; 0.1, 0.2."""
-    axis = one.xaxis if which == "x" else one.yaxis
-    (one.set_xscale if which == "x" else one.set_yscale)("log")
-    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=8))
-    axis.set_major_formatter(EngFormatter(sep="") if which == "x" else "{x:g}")
-    axis.set_minor_formatter(NullFormatter())
-
-
-def legend(made: Figure, axes: Sequence[Axes]) -> None:
-    """One legend below all panels, each entry once; and the panels' heights by their lines."""
-    found: dict[str, Any] = {}
-    for one in axes:
-        _limit(one)
-        for handle, label in zip(*one.get_legend_handles_labels(), strict=True):
-            found.setdefault(label, handle)
-    if found:
-        entry = ENTRY + LETTER * max(map(len, found))
-        columns = max(1, int(made.get_figwidth() / entry))
-        made.legend(
-            list(found.values()), list(found), loc="outside lower center",
-            ncols=min(columns, len(found)),
-        )  # fmt: skip
-
-
 def _limit(one: Axes) -> None:
-    """Show the lines whole; bands of two seeds, which are 13 standard errors high, may be cut."""
+    """Show lines whole but cut high bands: one of two seeds reaches 13 standard errors."""
     drawn = [np.asarray(artist.get_ydata(), dtype=np.float64) for artist in one.get_lines()]
     long = [values for values in drawn if not np.array_equal(values, [0, 1])]  # vertical lines
     if not long or one.get_yscale() == "log":
@@ -177,6 +215,15 @@ def _limit(one: Axes) -> None:
     spare = SPARE * ((high - low) or abs(high) or 1.0)
     bottom, top = one.get_ylim()
     one.set_ylim(max(bottom, low - spare), min(top, high + spare))
+
+
+def logarithmic(one: Axes, which: str) -> None:
+    """Make an axis logarithmic, with labels over less than a decade, too: 500, 1k, 2k."""
+    axis = one.xaxis if which == "x" else one.yaxis
+    (one.set_xscale if which == "x" else one.set_yscale)("log")
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=8))
+    axis.set_major_formatter(EngFormatter(sep="") if which == "x" else "{x:g}")
+    axis.set_minor_formatter(NullFormatter())
 
 
 def save(name: str, drawing: Drawing, folder: Path) -> None:
@@ -189,9 +236,9 @@ def save(name: str, drawing: Drawing, folder: Path) -> None:
 
 
 def draw(name: str, results: Results) -> Drawing:
-    """Draw one figure in the house's style.
+    """Draw a figure in the reports' style.
 
-    :raises NotEnoughData: if these runs do not give it
+    :raises NotEnoughData: if these runs are not enough for it
     """
     with matplotlib.rc_context(STYLE):
         return FIGURES[name].draw(results)

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from sb3_sparse.report.backend import PercentFormatter
-from sb3_sparse.report.figures.base import Drawing, figure, legend, panels
+from sb3_sparse.report.figures.base import Drawing, Sheet, figure
 from sb3_sparse.report.methods import DENSE, EQUAL
 from sb3_sparse.report.results import NotEnoughData, Results
 
@@ -25,7 +23,7 @@ DRAWN = {
     "network's, against sparsity; counted from the layers, trained or not.",
 )
 def draw(results: Results) -> Drawing:
-    """A panel an architecture, a line a distribution."""
+    """Draw a panel for each architecture, with a line for each distribution."""
     found: dict[tuple[str, str], dict[str, dict[float, tuple[int, int]]]] = {}
     for run in results.runs:
         if run.label not in (DENSE, EQUAL) and run.dense_flops:
@@ -34,28 +32,20 @@ def draw(results: Results) -> Drawing:
             counted.setdefault(run.level, (run.flops, run.dense_flops))
     if not found:
         raise NotEnoughData("no sparse run has its FLOPs counted")
-    made, axes = panels(len(found), columns=3, height=3.0)
-    rows: list[list[Any]] = []
-    for one, ((family, env_id), lines) in zip(axes, sorted(found.items()), strict=True):
+    sheet = Sheet(HEADS, len(found), height=3.0)
+    for one, ((family, env_id), lines) in zip(sheet.axes, sorted(found.items()), strict=True):
         for kind, counts in sorted(lines.items()):
             color, marker, style = DRAWN.get(kind, ("#444444", "D", ":"))
             levels = sorted(counts)
             shares = [counts[level][0] / counts[level][1] for level in levels]
             one.plot(
-                levels,
-                shares,
-                color=color,
-                marker=marker,
-                linestyle=style,
+                levels, shares, color=color, marker=marker, linestyle=style,
                 label=NAMES.get(kind, kind),
-            )
+            )  # fmt: skip
             for level, share in zip(levels, shares, strict=True):
-                rows.append([family, env_id, kind, level, *counts[level], share])
-        one.set_title(f"{family}\n{env_id}")
-        one.set_xlabel("sparsity")
-        one.set_ylabel("FLOPs, share of dense")
+                sheet.rows.append([family, env_id, kind, level, *counts[level], share])
+        one.set(title=f"{family}\n{env_id}", xlabel="sparsity", ylabel="FLOPs, share of dense")
         one.set_ylim(bottom=0)
-        one.xaxis.set_major_formatter(PercentFormatter(1.0, decimals=0, symbol=" %"))
-        one.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0, symbol=" %"))
-    legend(made, axes)
-    return Drawing(made, HEADS, rows)
+        for axis in (one.xaxis, one.yaxis):
+            axis.set_major_formatter(PercentFormatter(1.0, decimals=0, symbol=" %"))
+    return sheet.drawing()

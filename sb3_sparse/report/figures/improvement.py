@@ -1,10 +1,8 @@
-"""Probability that one method beats another."""
+"""The probability that one method beats another."""
 
 from __future__ import annotations
 
-from typing import Any
-
-from sb3_sparse.report.figures.base import Drawing, figure, panels
+from sb3_sparse.report.figures.base import Drawing, Sheet, figure
 from sb3_sparse.report.methods import DENSE, EQUAL, look_of, name_of
 from sb3_sparse.report.results import NotEnoughData, Results
 from sb3_sparse.report.scores import panels_of
@@ -22,31 +20,29 @@ SHORT = {DENSE: "dense 100 %", EQUAL: "equal dense"}
     "The vertical line is no difference.",
 )
 def draw(results: Results) -> Drawing:
-    """Sparse methods against both dense networks, and RigL against SET."""
+    """Draw sparse methods against both dense networks, and RigL against SET."""
     found, remarks = panels_of(results)
     paired = [(panel, pairs) for panel in found if (pairs := _pairs(list(panel.scores)))]
     if not paired:
         raise NotEnoughData("no sparsity has two methods to compare")
     most = max(len(pairs) for _, pairs in paired)
-    made, axes = panels(len(paired), height=1.2 + 0.26 * most)
-    rows: list[list[Any]] = []
-    for one, (panel, pairs) in zip(axes, paired, strict=True):
+    sheet = Sheet(HEADS, len(paired), height=1.2 + 0.26 * most)
+    for one, (panel, pairs) in zip(sheet.axes, paired, strict=True):
         for place, (better, worse) in enumerate(pairs):
             estimate = improvement(panel.scores[better], panel.scores[worse])
             value, low, high = estimate.value, estimate.low, estimate.high
             look = look_of(better)
             one.plot([low, high], [place, place], color=look.color, linewidth=4, alpha=0.4)
             one.plot(value, place, look.marker, color=look.color, markersize=6)
-            row: list[Any] = [panel.family, panel.level, better, worse, value, low, high]
-            rows.append([*row, estimate.seeds, len(panel.tasks)])
+            row = [panel.family, panel.level, better, worse, value, low, high]
+            sheet.rows.append([*row, estimate.seeds, len(panel.tasks)])
         one.axvline(0.5, color="#444444", linewidth=0.8)
         one.set_xlim(-0.06, 1.06)
         texts = [f"{name_of(a)} > {SHORT.get(b, name_of(b))}" for a, b in pairs]
         one.set_yticks(range(len(pairs)), texts)
         one.invert_yaxis()
-        one.set_title(panel.title)
-        one.set_xlabel("probability")
-    return Drawing(made, HEADS, rows, remarks)
+        one.set(title=panel.title, xlabel="probability")
+    return sheet.drawing(remarks)
 
 
 def _pairs(labels: list[str]) -> list[tuple[str, str]]:

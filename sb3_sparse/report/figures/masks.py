@@ -1,9 +1,8 @@
-"""Final masks."""
+"""The final masks."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -12,7 +11,7 @@ from sb3_sparse.loading.zips import look_into
 from sb3_sparse.policies.compiled import plain_names
 from sb3_sparse.report.backend import MaxNLocator
 from sb3_sparse.report.data import Array, RunData
-from sb3_sparse.report.figures.base import Drawing, figure, panels
+from sb3_sparse.report.figures.base import Drawing, Sheet, figure
 from sb3_sparse.report.methods import name_of, percent
 from sb3_sparse.report.results import NotEnoughData, Results
 
@@ -29,7 +28,7 @@ ORDER = ("rigl", "set", "prune", "static")
     "closest to 90 %; the first layers, of which the first reads the observation.",
 )
 def draw(results: Results) -> Drawing:
-    """A row a method, a panel a layer."""
+    """Draw a row for each method, with a panel for each layer."""
     remarks: list[str] = []
     shown: list[tuple[RunData, list[tuple[str, tuple[int, ...], Array]]]] = []
     for run in _chosen(results):
@@ -46,10 +45,9 @@ def draw(results: Results) -> Drawing:
         why = f" {'; '.join(remarks)}" if remarks else ""
         raise NotEnoughData(f"no sparse run has a final model with masks.{why}")
     columns = max(len(masks) for _, masks in shown)
-    made, axes = panels(len(shown) * columns, columns=columns, height=2.3)
-    rows: list[list[Any]] = []
+    sheet = Sheet(HEADS, len(shown) * columns, columns=columns, height=2.3)
     for row, (run, masks) in enumerate(shown):
-        here = axes[row * columns : (row + 1) * columns]
+        here = sheet.axes[row * columns : (row + 1) * columns]
         for one in here[len(masks) :]:
             one.remove()
         for one, (name, shape, blocks) in zip(here, masks, strict=False):
@@ -66,12 +64,12 @@ def draw(results: Results) -> Drawing:
             for place, densities in enumerate(blocks):
                 text = " ".join(f"{density:.3g}" for density in densities)
                 dims = "x".join(map(str, shape))
-                rows.append([run.folder.name, run.label, run.level, name, dims, place, text])
-    return Drawing(made, HEADS, rows, remarks)
+                sheet.rows.append([run.folder.name, run.label, run.level, name, dims, place, text])
+    return Drawing(sheet.figure, sheet.heads, sheet.rows, remarks)
 
 
 def _chosen(results: Results) -> list[RunData]:
-    """Of the first family and task with sparse runs: one run of each method."""
+    """Choose one run of each method, of the first family and task with sparse runs."""
     sparse = [run for run in results.main if run.label in ORDER]
     if not sparse:
         return []
@@ -83,7 +81,7 @@ def _chosen(results: Results) -> list[RunData]:
 
 
 def masks_of(run: RunData) -> list[tuple[str, tuple[int, ...], Array]]:
-    """Names, shapes and block densities of the first layers' masks, out of the final model.
+    """Read names, shapes and block densities of the first layers' masks from the final model.
 
     :raises ConfigError: if there is no model
     :raises CorruptStateError: if it is damaged
@@ -99,13 +97,13 @@ def masks_of(run: RunData) -> list[tuple[str, tuple[int, ...], Array]]:
 
 
 def density_of(run: RunData, name: str) -> float:
-    """Share of a layer's connections that is active."""
+    """Return the share of a layer's connections that are active."""
     layer = next(layer for layer in run.layers if layer["name"] == name)
     return float(layer["nnz"]) / float(np.prod(layer["shape"]))
 
 
 def blocks_of(mask: Array, most: int = BLOCKS) -> Array:
-    """Mean of a matrix over at most ``most`` by ``most`` blocks of almost equal size."""
+    """Average a matrix over at most ``most`` by ``most`` blocks of almost equal size."""
     for axis in (0, 1):
         size = mask.shape[axis]
         if size > most:

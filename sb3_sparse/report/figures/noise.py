@@ -1,11 +1,10 @@
-"""Return of trained policies under observation noise."""
+"""The return of trained policies under observation noise."""
 
 from __future__ import annotations
 
 from collections import defaultdict
-from typing import Any
 
-from sb3_sparse.report.figures.base import Drawing, figure, legend, line, panels
+from sb3_sparse.report.figures.base import Drawing, Sheet, figure
 from sb3_sparse.report.measured import NOISE, returns_by_sigma
 from sb3_sparse.report.methods import DENSE, name_of, percent, shaded
 from sb3_sparse.report.results import NotEnoughData, Results
@@ -23,7 +22,7 @@ HEADS = ("family", "environment", "method", "parameters kept", "sigma", "return"
     "and line styles the method.",
 )
 def draw(results: Results) -> Drawing:
-    """A panel an environment, a line for each method and regime."""
+    """Draw a panel for each environment, with a line for each method and regime."""
     found: dict[tuple[str, str], dict[tuple[float, str], list[dict[float, float]]]] = {}
     for run in results.main:
         by_sigma = returns_by_sigma(run.measured)
@@ -32,22 +31,16 @@ def draw(results: Results) -> Drawing:
             lines[run.level, run.label].append(by_sigma)
     if not found:
         raise NotEnoughData(f"no run has a {NOISE}")
-    made, axes = panels(len(found), columns=3, height=3.2)
+    sheet = Sheet(HEADS, len(found), height=3.2)
     regimes = sorted({level for lines in found.values() for level, _ in lines})
-    rows: list[list[Any]] = []
-    for one, ((family, env_id), lines) in zip(axes, sorted(found.items()), strict=True):
+    for one, ((family, env_id), lines) in zip(sheet.axes, sorted(found.items()), strict=True):
         for (level, label), seeds in sorted(lines.items()):
             sigmas, ends = means_at(seeds)
             if not sigmas:
                 continue
             look = shaded(label, regimes.index(level))
             kept = "" if label == DENSE else f", {percent(1 - level)} kept"
-            line(one, sigmas, ends, look, f"{name_of(label)}{kept}")
-            for sigma, *values in zip(sigmas, *ends, strict=True):
-                place: list[Any] = [family, env_id, label, 1 - level, sigma]
-                rows.append([*place, *map(float, values), len(seeds)])
-        one.set_title(f"{family}\n{env_id}")
-        one.set_xlabel("σ of the noise")
-        one.set_ylabel("mean return")
-    legend(made, axes)
-    return Drawing(made, HEADS, rows)
+            place = [family, env_id, label, 1 - level]
+            sheet.line(one, place, sigmas, ends, [len(seeds)], look, f"{name_of(label)}{kept}")
+        one.set(title=f"{family}\n{env_id}", xlabel="σ of the noise", ylabel="mean return")
+    return sheet.drawing()

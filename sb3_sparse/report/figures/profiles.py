@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
-from sb3_sparse.report.figures.base import Drawing, figure, legend, line, panels
+from sb3_sparse.report.figures.base import Drawing, Sheet, figure
 from sb3_sparse.report.methods import look_of, name_of
 from sb3_sparse.report.results import Results
 from sb3_sparse.report.scores import panels_of
@@ -23,23 +21,23 @@ POINTS, REPS = 61, 1000
     "pointwise stratified bootstrap bands (rliable). Higher is better.",
 )
 def draw(results: Results) -> Drawing:
-    """A panel a sparsity, a line a method."""
+    """Draw a panel for each sparsity, with a line for each method."""
     found, remarks = panels_of(results)
-    made, axes = panels(len(found))
-    rows: list[list[Any]] = []
-    for one, panel in zip(axes, found, strict=True):
+    sheet = Sheet(HEADS, len(found))
+    for one, panel in zip(sheet.axes, found, strict=True):
         every = np.concatenate([scores.ravel() for scores in panel.scores.values()])
         pad = 0.05 * (np.ptp(every) or 1.0)
         taus = np.linspace(every.min() - pad, every.max() + pad, POINTS)
         for label, given in panel.scores.items():
-            ends = profile(given, taus, REPS)
-            line(one, taus.tolist(), ends, look_of(label), name_of(label))
-            for tau, *values in zip(taus, *ends, strict=True):
-                place: list[Any] = [panel.family, panel.level, label, float(tau)]
-                rows.append([*place, *map(float, values), len(given), len(panel.tasks)])
-        one.set_title(panel.title)
-        one.set_xlabel("normalised score")
-        one.set_ylabel("share of runs above")
+            sheet.line(
+                one,
+                [panel.family, panel.level, label],
+                taus.tolist(),
+                profile(given, taus, REPS),
+                [len(given), len(panel.tasks)],
+                look_of(label),
+                name_of(label),
+            )
+        one.set(title=panel.title, xlabel="normalised score", ylabel="share of runs above")
         one.set_ylim(-0.03, 1.03)
-    legend(made, axes)
-    return Drawing(made, HEADS, rows, remarks)
+    return sheet.drawing(remarks)

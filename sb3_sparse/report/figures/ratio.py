@@ -1,18 +1,11 @@
-"""Reward against the actor's share of the parameters."""
+"""The reward against the actor's share of the parameters."""
 
 from __future__ import annotations
 
 from collections import defaultdict
-from typing import Any
 
 from sb3_sparse.report.data import RunData
-from sb3_sparse.report.figures.base import (
-    Drawing,
-    estimates_line,
-    figure,
-    legend,
-    panels,
-)
+from sb3_sparse.report.figures.base import Drawing, Sheet, figure
 from sb3_sparse.report.methods import DENSE, name_of, percent, shaded
 from sb3_sparse.report.results import NotEnoughData, Results
 from sb3_sparse.report.statistics import mean
@@ -30,7 +23,7 @@ Line = tuple[str, float, str]
     "split, the horizontal one the dense network of full size.",
 )
 def draw(results: Results) -> Drawing:
-    """A panel an environment, a line a budget and method."""
+    """Draw a panel for each environment, with a line for each budget and method."""
     found: dict[tuple[str, str], dict[Line, dict[float, list[RunData]]]] = {}
     for run in results.trained:
         if run.actor_share is not None:
@@ -47,19 +40,16 @@ def draw(results: Results) -> Drawing:
             "no method was trained with two shares of the actor or more (actor_share) that differ "
             "in nothing else"
         )
-    made, axes = panels(len(places), columns=3, height=3.0)
-    rows: list[list[Any]] = []
-    for one, ((family, env_id), lines) in zip(axes, sorted(places.items()), strict=True):
+    sheet = Sheet(HEADS, len(places), height=3.0)
+    for one, ((family, env_id), lines) in zip(sheet.axes, sorted(places.items()), strict=True):
         budgets = sorted({budget for _, budget, _ in lines}, reverse=True)
         for (label, budget, _), shares in sorted(lines.items()):
             estimates = {x: mean([run.score for run in runs]) for x, runs in sorted(shares.items())}
-            for x, e in estimates.items():
-                rows.append([family, env_id, label, budget, x, e.value, e.low, e.high, e.seeds])
             look = shaded(label, budgets.index(budget))
             name = "Dense" if label == DENSE else name_of(label)
             text = f"{name}, {percent(budget)} of parameters"
-            shown = [100 * x for x in estimates]
-            estimates_line(one, shown, list(estimates.values()), look, text)
+            place = [family, env_id, label, budget]
+            sheet.estimates(one, place, estimates, [100 * x for x in estimates], look, text)
         usual = _usual(results, family, env_id)
         if usual is not None:
             one.axvline(100 * usual, color="#999999", linewidth=0.9, linestyle=":")
@@ -67,15 +57,13 @@ def draw(results: Results) -> Drawing:
         if dense:
             level_line = mean([run.score for run in dense]).value
             one.axhline(level_line, color="#444444", linestyle="--", label=name_of(DENSE))
-        one.set_title(f"{family}\n{env_id}")
-        one.set_xlabel("actor's share of connections, %")
-        one.set_ylabel("mean score")
-    legend(made, axes)
-    return Drawing(made, HEADS, rows)
+        title = f"{family}\n{env_id}"
+        one.set(title=title, xlabel="actor's share of connections, %", ylabel="mean score")
+    return sheet.drawing()
 
 
 def _budget(results: Results, run: RunData) -> float:
-    """Share of the connections of the largest dense network; of dense ones to one digit."""
+    """Return the share of the largest dense network's connections, for dense runs to one digit."""
     if run.label != DENSE:
         return round(1 - run.level, 6)
     dense = [
@@ -87,7 +75,7 @@ def _budget(results: Results, run: RunData) -> float:
 
 
 def _usual(results: Results, family: str, env_id: str) -> float | None:
-    """The split that nobody asked for: that of the runs without an ``actor_share``."""
+    """Return the standard split, i.e. that of the runs without an ``actor_share``."""
     shares: dict[str, list[float]] = defaultdict(list)
     for run in results.trained:
         if (run.family, run.env_id) == (family, env_id) and run.actor_share is not None:

@@ -1,17 +1,11 @@
-"""Reward against a setting that was varied."""
+"""The reward against a setting that was varied."""
 
 from __future__ import annotations
 
 from typing import Any
 
 from sb3_sparse.report.data import RunData
-from sb3_sparse.report.figures.base import (
-    Drawing,
-    estimates_line,
-    figure,
-    legend,
-    panels,
-)
+from sb3_sparse.report.figures.base import Drawing, Sheet, figure
 from sb3_sparse.report.methods import DENSE, in_order, look_of, name_of, percent
 from sb3_sparse.report.results import NotEnoughData, Results
 from sb3_sparse.report.statistics import mean
@@ -28,7 +22,7 @@ Place = tuple[str, str, float]
     "being the same, with 95 % Student t intervals; a panel for each environment and sparsity.",
 )
 def draw(results: Results) -> Drawing:
-    """A panel for each environment and sparsity, a line a method."""
+    """Draw a panel for each environment and sparsity, with a line for each method."""
     name = results.varies
     if name is None:
         raise NotEnoughData("it needs the name of the setting that was varied (varies)")
@@ -46,30 +40,28 @@ def draw(results: Results) -> Drawing:
         raise NotEnoughData(
             f"no method was trained with two values of {name} or more that differ in nothing else"
         )
-    made, axes = panels(len(places), columns=3, height=3.0)
-    rows: list[list[Any]] = []
-    for one, ((family, env_id, level), lines) in zip(axes, sorted(places.items()), strict=True):
+    sheet = Sheet(HEADS, len(places), height=3.0)
+    panels = zip(sheet.axes, sorted(places.items()), strict=True)
+    for one, ((family, env_id, level), lines) in panels:
         ticks = sorted({value for values in lines.values() for value in values}, key=_order)
         order = in_order({label for label, _ in lines})
         for (label, _), values in sorted(lines.items(), key=lambda item: order.index(item[0][0])):
-            shown = [value for value in ticks if value in values]
-            estimates = [mean([run.score for run in values[value]]) for value in shown]
-            place: list[Any] = [family, env_id, level, label, name]
-            for value, e in zip(shown, estimates, strict=True):
-                rows.append([*place, value, e.value, e.low, e.high, e.seeds])
-            x = [float(ticks.index(value)) for value in shown]
-            estimates_line(one, x, estimates, look_of(label), name_of(label))
+            estimates = {
+                value: mean([run.score for run in values[value]])
+                for value in ticks
+                if value in values
+            }
+            place = [family, env_id, level, label, name]
+            x = [float(ticks.index(value)) for value in estimates]
+            sheet.estimates(one, place, estimates, x, look_of(label), name_of(label))
         one.set_xticks(range(len(ticks)), [str(value) for value in ticks])
-        one.set_xlabel(name)
-        one.set_ylabel("mean score")
         at = "" if level == 0 and order == [DENSE] else f", {percent(level)}"
-        one.set_title(f"{family}\n{env_id}{at}")
-    legend(made, axes)
-    return Drawing(made, HEADS, rows)
+        one.set(title=f"{family}\n{env_id}{at}", xlabel=name, ylabel="mean score")
+    return sheet.drawing()
 
 
 def _key(value: Any) -> Any:
-    """A value as a mark on the axis."""
+    """Return a value as a tick of the axis."""
     if isinstance(value, (int, float)) and not isinstance(value, bool):
         return float(f"{value:.6g}")
     if isinstance(value, (list, tuple)):

@@ -1,18 +1,10 @@
-"""Signal-to-noise ratio of gradients over training."""
+"""The signal-to-noise ratio of gradients over training."""
 
 from __future__ import annotations
 
 from collections import defaultdict
-from typing import Any
 
-from sb3_sparse.report.figures.base import (
-    Drawing,
-    figure,
-    legend,
-    line,
-    logarithmic,
-    panels,
-)
+from sb3_sparse.report.figures.base import Drawing, Sheet, figure, logarithmic
 from sb3_sparse.report.measured import SNR, Points, snr_by_network
 from sb3_sparse.report.methods import DENSE, name_of, percent, shaded
 from sb3_sparse.report.results import NotEnoughData, Results
@@ -30,7 +22,7 @@ HEADS = ("family", "environment", "network", "method", "sparsity", "timesteps", 
     "network, a colour for each sparsity, a marker and line style for each method.",
 )
 def draw(results: Results) -> Drawing:
-    """A panel a network, a line for each method and sparsity."""
+    """Draw a panel for each network, with a line for each method and sparsity."""
     found: dict[tuple[str, str, str], dict[tuple[str, float], list[Points]]] = {}
     for run in results.main:
         for network, points in snr_by_network(run.measured).items():
@@ -38,23 +30,19 @@ def draw(results: Results) -> Drawing:
             lines[run.label, run.level].append(points)
     if not found:
         raise NotEnoughData(f"no run has a {SNR}")
-    made, axes = panels(len(found), columns=3, height=3.0)
+    sheet = Sheet(HEADS, len(found), height=3.0)
     levels = sorted({level for lines in found.values() for _, level in lines})
-    rows: list[list[Any]] = []
-    for one, ((family, env_id, network), lines) in zip(axes, sorted(found.items()), strict=True):
+    panels = zip(sheet.axes, sorted(found.items()), strict=True)
+    for one, ((family, env_id, network), lines) in panels:
         for (label, level), seeds in sorted(lines.items(), key=lambda item: item[0][::-1]):
             steps, ends = means_at([dict(points) for points in seeds])
             if not steps:
                 continue
             look = shaded(label, levels.index(level))
             text = name_of(label) if label == DENSE else f"{name_of(label)}, {percent(level)}"
-            line(one, steps, ends, look, text)
-            for step, *values in zip(steps, *ends, strict=True):
-                place: list[Any] = [family, env_id, network, label, level, int(step)]
-                rows.append([*place, *map(float, values), len(seeds)])
+            place = [family, env_id, network, label, level]
+            sheet.line(one, place, list(map(int, steps)), ends, [len(seeds)], look, text)
         logarithmic(one, "y")
-        one.set_title(f"{family}\n{env_id}, {network}")
-        one.set_xlabel("environment steps")
-        one.set_ylabel("SNR")
-    legend(made, axes)
-    return Drawing(made, HEADS, rows)
+        title = f"{family}\n{env_id}, {network}"
+        one.set(title=title, xlabel="environment steps", ylabel="SNR")
+    return sheet.drawing()
