@@ -10,8 +10,7 @@ from pathlib import Path
 
 import optuna
 
-from sb3_sparse.tuning import Objective, Space, tune, write_report
-from sb3_sparse.tuning.storage import open_storage
+from sb3_sparse.tuning import Objective, Space, open_storage, tune, write_report
 from sb3_sparse.zoo.spec import RunSpec
 
 choices = optuna.distributions.CategoricalDistribution
@@ -34,14 +33,14 @@ def main() -> None:
         },
     )
 
-    # In one call: a grid, every cell once, by processes that share a journal in logs/tune.
+    # In one call: a grid, each cell once, trained by processes that share a journal in logs/tune.
     tuned = tune(run, space, trials=args.trials, workers=args.workers, log_folder=args.logs)
     assert tuned.best is not None, tuned.errors
     print(f"grid: return {tuned.best.value:.1f} with {tuned.best.params}, saved in {tuned.config}")
     storage = open_storage(args.logs / "tune" / "journal.log")
     print(f"page: {write_report([tuned.study], storage, tuned.folder / 'report.html')}")
 
-    # Step by step: the objective is one like any other of Optuna's, for a sampler of your choice.
+    # Step by step: an objective for an Optuna study of your own, with a sampler of your choice.
     study = optuna.create_study(sampler=optuna.samplers.TPESampler(seed=0), direction="maximize")
     study.optimize(Objective(run, space, seeds=1, folder=args.logs / "own"), n_trials=2)
     print(f"own study: return {study.best_value:.1f} with {study.best_params}")

@@ -29,7 +29,7 @@ def test_tune_searches_writes_the_best_goes_on_and_reports(tmp_path):
         r"2 of 2: trial 1 score \S+, best so far \S+ \(trial [01]\); weight_decay (0|0.0001)",
         lines[1],
     )
-    assert f"Study {STUDY}: 2 of 2 trials are done." in lines
+    assert f"Search {STUDY}: 2 of 2 trials are done." in lines
     best = tmp_path / "logs" / "tune" / STUDY / "best.yml"
     given = best.relative_to(tmp_path)  # as --log-folder is
     command = f"sb3-sparse train --algo dqn --env CartPole-v1 --conf-file {given}"
@@ -37,11 +37,13 @@ def test_tune_searches_writes_the_best_goes_on_and_reports(tmp_path):
     assert f"sb3-sparse tune report {STUDY}" in lines
     merged = yaml.safe_load(target.read_text())
     assert merged["CartPole-v1"] == yaml.safe_load(best.read_text())["CartPole-v1"]
-    assert target.read_text().startswith("# mine\nCartPole-v1:\n  # Tuned by sb3-sparse: study ")
+    assert target.read_text().startswith("# mine\nCartPole-v1:\n  # Tuned by sb3-sparse: search ")
     assert target.read_text().endswith("Other-v0: {a: 1}  # stays\n")
 
     done = sb3_sparse(*args, cwd=tmp_path)
-    assert done.stdout.startswith(f"The study {STUDY} is finished: 2 of 2 trials are done. Nothing")
+    assert done.stdout.startswith(
+        f"The search {STUDY} is finished: 2 of 2 trials are done. Nothing"
+    )
 
     done = sb3_sparse("tune", "report", STUDY, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -84,7 +86,7 @@ DATABASE = "postgresql://me:s3cret@127.0.0.1:9/x"
             ["-n", "600", "--eval-freq", "601"],
             "a run of 600 steps that is evaluated every 601 has no score",
         ),
-        (["report", "x"], "there are no studies in logs/tune/journal.log"),
+        (["report", "x"], "there are no searches in logs/tune/journal.log"),
     ],
 )
 def test_mistakes_are_one_line_and_make_nothing(args, message, tmp_path, mistake):

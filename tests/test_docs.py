@@ -26,8 +26,8 @@ from sb3_sparse.export import export_policy
 from sb3_sparse.policies import registry as algorithms_registry
 from sb3_sparse.topology import registry
 from sb3_sparse.tuning import space_of
-from sb3_sparse.tuning.search import define
 from sb3_sparse.tuning.spaces import check_space
+from sb3_sparse.tuning.tuner import define
 from sb3_sparse.zoo.spec import RunSpec
 from sb3_sparse.zoo.training import train
 
@@ -39,15 +39,10 @@ WITHOUT_EXAMPLE: set[str] = {
     "sb3_sparse.export.ExportReport",
     "sb3_sparse.export.Parity",
     "sb3_sparse.report.LeftOut",
-    "sb3_sparse.report.Results",
     "sb3_sparse.report.RunData",
-    "sb3_sparse.report.Verdict",
     "sb3_sparse.studies.CellStatus",
     "sb3_sparse.studies.Progress",
     "sb3_sparse.studies.Study",
-    "sb3_sparse.tuning.Objective",
-    "sb3_sparse.tuning.Space",
-    "sb3_sparse.tuning.Tuned",
 }
 """Public classes whose docstring has no example yet."""
 

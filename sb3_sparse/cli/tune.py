@@ -29,6 +29,7 @@ from sb3_sparse.cli.common import (
     Steps,
     console,
     option,
+    say,
     values_and_packages,
 )
 from sb3_sparse.cli.progress.tune import TuningProgress, values_in_words
@@ -77,24 +78,24 @@ def search(
         int | None,
         option("How many trials.", "--trials", "--n-trials", shown="a whole grid, else 100"),
     ] = None,
-    seeds: Annotated[int, option("Runs a trial; the mean counts.")] = 1,
+    seeds: Annotated[int, option("Runs per trial; the mean counts.")] = 1,
     sampler: Annotated[
-        str | None, option("grid, tpe or random.", shown="grid where all is lists, else tpe")
+        str | None, option("grid, tpe or random.", shown="grid if all is lists, else tpe")
     ] = None,
     pruner: Annotated[
         str | None,
         option("none, median, halving or hyperband.", shown="none for a grid, else median"),
     ] = None,
-    workers: Annotated[int, option("Trials at once, each a process of one thread.")] = 1,
+    workers: Annotated[int, option("Trials at once, each in a process with one thread.")] = 1,
     launcher: Launcher = "local",
     address: Address = None,
     storage: Storage = None,
     study_name: Annotated[
-        str | None, option("Name of the study.", shown="made of algorithm, env, method, space")
+        str | None, option("Name of the search.", shown="made of algorithm, env, method, space")
     ] = None,
     write_into: Annotated[
         Path | None,
-        option("A config, e.g. zoo_hparams/rigl/sac.yml, whose entry gets the best values too."),
+        option("A config, e.g. zoo_hparams/rigl/sac.yml, whose entry also gets the best values."),
     ] = None,
     seed: Annotated[int, option("First seed of every trial, and the sampler's.")] = 0,
     n_timesteps: Steps = None,
@@ -107,9 +108,9 @@ def search(
     device: Device = "auto",
     log_folder: LogFolder = Path("logs"),
 ) -> None:
-    """Search hyperparameters with Optuna; `sb3-sparse tune report STUDY` looks at a study.
+    """Search hyperparameters with Optuna; `sb3-sparse tune report SEARCH` writes a page on it.
 
-    The same command goes on with an interrupted study, and on another machine joins it.
+    The same command continues an interrupted search, and joins it on another machine.
     """
     values, packages = values_and_packages(context.args, hyperparams, gym_packages)
     check_names(space, sampler, pruner)
@@ -130,10 +131,10 @@ def search(
         device=device,
         gym_packages=tuple(packages),
     )
-    run.config_entry()  # a mistyped name shall not wait for torch
+    run.config_entry()  # a typo shows before torch is imported
     from sb3_sparse.tuning import tune
-    from sb3_sparse.tuning.best import check_target
-    from sb3_sparse.tuning.best import write_into as merge
+    from sb3_sparse.tuning.best import check_target, merge_best
+    from sb3_sparse.tuning.search import Search
 
     if write_into is not None:
         check_target(run, write_into)
@@ -155,14 +156,14 @@ def search(
         )
     except KeyboardInterrupt:
         progress.close()
-        console.print("Interrupted. What was done is kept; the same command goes on.")
+        console.print("Interrupted. Finished trials are kept; the same command continues.")
         raise typer.Exit(INTERRUPTED) from None
     finally:
         progress.close()
     _print_outcome(run, tuned, storage, log_folder)
     if write_into is not None and tuned.best is not None:
-        merge(tuned.study, write_into)
-        _say(f"Merged into {write_into}")
+        merge_best(Search(tuned.study), write_into)
+        say(f"Merged into {write_into}")
     if not tuned.status.finished:
         raise typer.Exit(1)
 
@@ -172,48 +173,43 @@ def _print_outcome(run: RunSpec, tuned: Tuned, storage: str | None, log_folder: 
 
     status, name = tuned.status, tuned.study.study_name
     for worker, error in tuned.errors.items():
-        _say(f"{worker}: {error.strip().splitlines()[-1]}")
+        say(f"{worker}: {error.strip().splitlines()[-1]}")
     done = f"{len(status.done)} of {status.planned} trials are done"
     if not tuned.began:
-        _say(f"The study {name} is finished: {done}. Nothing to do.")
+        say(f"The search {name} is finished: {done}. Nothing to do.")
     elif status.finished:
-        _say(f"Study {name}: {done}.")
+        say(f"Search {name}: {done}.")
     else:
-        _say(
-            f"Study {name}: {done}, {len(status.failed)} failed; the logs of the workers are in "
-            f"{tuned.folder}. The same command goes on, and tries failed trials again."
+        say(
+            f"Search {name}: {done}, {len(status.failed)} failed; the logs of the workers are in "
+            f"{tuned.folder}. The same command continues, and tries failed trials again."
         )
     if tuned.best is None or tuned.config is None:
         return
     best = tuned.best
-    _say(f"Best: {best.values[0]:.6g}, trial {best.number}: {values_in_words(best)}")
-    _say("Train with these values, look at the study:")
+    say(f"Best: {best.values[0]:.6g}, trial {best.number}: {values_in_words(best)}")
+    say("Train with these values, look at the search:")
     where = [] if storage is None else ["--storage", shown_url(storage)]
     where += [] if log_folder == Path("logs") else ["--log-folder", str(log_folder)]
     train = ["train", "--algo", run.algo, "--env", run.env_id, "--conf-file", str(tuned.config)]
     for package in run.gym_packages:
         train += ["--gym-packages", package]
     for command in (train, ["tune", "report", name, *where]):
-        _say(shlex.join(["sb3-sparse", *command]))
-
-
-def _say(text: str) -> None:
-    """A line as it is, however long."""
-    console.print(text, soft_wrap=True)
+        say(shlex.join(["sb3-sparse", *command]))
 
 
 @tuning.command()
 def report(
-    studies: Annotated[list[str], typer.Argument(help="Names of studies.", metavar="STUDY...")],
+    searches: Annotated[list[str], typer.Argument(help="Names of searches.", metavar="SEARCH...")],
     storage: Storage = None,
     out: Annotated[
-        Path | None, option("The page.", shown="report.html in the first study's folder")
+        Path | None, option("The page.", shown="report.html in the first search's folder")
     ] = None,
     log_folder: LogFolder = Path("logs"),
 ) -> None:
-    """Write one HTML page on studies, and a CSV of their trials."""
-    from sb3_sparse.tuning.report import report_on
+    """Write an HTML page on searches, and a CSV of their trials."""
+    from sb3_sparse.tuning.report import report_by_name
 
-    page = report_on(studies, storage, log_folder, out)
-    _say(f"Page: {page}")
-    _say(f"Trials: {page.with_suffix('.csv')}")
+    page = report_by_name(searches, storage, log_folder, out)
+    say(f"Page: {page}")
+    say(f"Trials: {page.with_suffix('.csv')}")

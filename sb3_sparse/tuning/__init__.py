@@ -9,15 +9,17 @@ from sb3_sparse.lazy import lazily
 if TYPE_CHECKING:
     from sb3_sparse.tuning.objective import Objective
     from sb3_sparse.tuning.report import write_report
-    from sb3_sparse.tuning.search import Tuned, tune
     from sb3_sparse.tuning.shipped import paper_space, wide_space
     from sb3_sparse.tuning.spacefile import space_of
     from sb3_sparse.tuning.spaces import Space
+    from sb3_sparse.tuning.storage import open_storage
+    from sb3_sparse.tuning.tuner import Tuned, tune
 
 __all__ = [
     "Objective",
     "Space",
     "Tuned",
+    "open_storage",
     "paper_space",
     "space_of",
     "tune",
@@ -29,10 +31,11 @@ __getattr__, __dir__ = lazily(
     {
         "Objective": "objective",
         "Space": "spaces",
-        "Tuned": "search",
+        "Tuned": "tuner",
+        "open_storage": "storage",
         "paper_space": "shipped",
         "space_of": "spacefile",
-        "tune": "search",
+        "tune": "tuner",
         "wide_space": "shipped",
         "write_report": "report",
     },

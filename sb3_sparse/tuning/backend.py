@@ -1,4 +1,4 @@
-"""The one place that asks whether Optuna is there."""
+"""Optuna, an optional dependency: every module of the package imports it from here."""
 
 from __future__ import annotations
 
@@ -29,9 +29,10 @@ __all__ = [
 
 @contextmanager
 def quiet_optuna() -> Iterator[None]:
-    """Within it, Optuna says what goes wrong, and no more. Afterwards all is as it was.
+    """Make Optuna log warnings only, within the block.
 
-    Lists are good choices too, e.g. of net_arch: they are written to storages as they are.
+    It also silences Optuna's warning that a list, e.g. of net_arch, is not a good choice: storages
+    write lists as they are.
     """
     level = optuna.logging.get_verbosity()
     optuna.logging.set_verbosity(max(level, optuna.logging.WARNING))

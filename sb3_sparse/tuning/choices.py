@@ -1,4 +1,4 @@
-"""Names of samplers, pruners and shipped spaces, known without Optuna."""
+"""Names of samplers, pruners and shipped spaces, which are known without Optuna."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ SPACE_FILES = (".yml", ".yaml", ".py")
 
 
 def check_choice(what: str, name: str, allowed: Sequence[str]) -> None:
-    """Refuse a name that is not allowed.
+    """Check that a name is allowed.
 
-    :raises ConfigError: if so
+    :raises ConfigError: if it is not
     """
     if name not in allowed:
         raise ConfigError(
@@ -25,17 +25,17 @@ def check_choice(what: str, name: str, allowed: Sequence[str]) -> None:
         )
 
 
-def check_space(what: str) -> None:
-    """Refuse what is neither a shipped space nor a file.
+def check_space_name(name: str) -> None:
+    """Check that a name is that of a shipped space or of a file.
 
-    :raises ConfigError: if so
+    :raises ConfigError: if it is neither
     """
-    if what in SPACES:
+    if name in SPACES:
         return
-    path = Path(what)
+    path = Path(name)
     if path.suffix not in SPACE_FILES:
         raise ConfigError(
-            f"unknown search space {what!r}{did_you_mean(what, SPACES)}; allowed are "
+            f"unknown search space {name!r}{did_you_mean(name, SPACES)}; allowed are "
             f"{', '.join(SPACES)}, or a file of your own, .yml or .py (docs/tuning.md)"
         )
     if not path.is_file():
@@ -43,13 +43,13 @@ def check_space(what: str) -> None:
 
 
 def check_names(space: str, sampler: str | None, pruner: str | None) -> None:
-    """Refuse names that there are not, before anything is imported that takes its time.
+    """Check the names of a command before any slow import.
 
     :param sampler: None: the one that suits the space
     :param pruner: None: the one that suits the sampler
-    :raises ConfigError: if there are any
+    :raises ConfigError: for an unknown name
     """
-    check_space(space)
+    check_space_name(space)
     if sampler is not None:
         check_choice("sampler", sampler, SAMPLERS)
     if pruner is not None:

@@ -1,4 +1,4 @@
-"""Studies in a database that SQLAlchemy has a URL for."""
+"""Databases, by SQLAlchemy's URLs."""
 
 from __future__ import annotations
 
@@ -9,46 +9,46 @@ from contextlib import contextmanager, suppress
 from typing import Any, TypeVar
 
 from optuna.storages import RDBStorage
-from optuna.storages._cached_storage import _CachedStorage
 
 from sb3_sparse.errors import ConfigError, MissingExtra
 from sb3_sparse.tuning.backend import BaseStorage, TrialState, optuna
+from sb3_sparse.tuning.internals import CachedStorage
 from sb3_sparse.tuning.queue import FromQueue, StaleCallback
 from sb3_sparse.tuning.urls import shown_url, url_of
 
 OPENINGS = 20
-MOMENT = 0.5
+PAUSE = 0.5  # seconds between two openings
 T = TypeVar("T")
 PATIENCE = 60  # seconds that SQLite waits for other processes
 
 
-class QueueDatabase(FromQueue, _CachedStorage):
-    """A database behind SQLAlchemy, wrapped as Optuna wraps it."""
+class QueueDatabase(FromQueue, CachedStorage):
+    """A database, with the cache that Optuna puts before it."""
 
     def set_trial_state_values(
         self, trial_id: int, state: TrialState, values: Sequence[float] | None = None
     ) -> bool:
-        """As in Optuna, but a first sign of life comes before a trial is taken.
+        """Set the state as Optuna does, after a first sign of life if a trial is taken.
 
-        Optuna takes no trial for lost that gave none, e.g. as its worker was killed right then.
+        To Optuna a trial without any sign is never lost, even if its worker was killed right then.
         """
         if state == TrialState.RUNNING:
             self.record_heartbeat(trial_id)
         return super().set_trial_state_values(trial_id, state, values)
 
     def record_heartbeat(self, trial_id: int) -> None:
-        """As in Optuna; where the database is away for a moment, the next time will do."""
+        """Record a sign of life; if the database is away for a moment, the next one will do."""
         with suppress(optuna.exceptions.StorageInternalError):
             super().record_heartbeat(trial_id)
 
 
 def open_database(storage: str, interval: int, stale: StaleCallback) -> BaseStorage:
-    """A database that workers take trials from, with tables made where there are none.
+    """Open a database that workers take trials from; missing tables are made.
 
     :param storage: URL
     :param interval: seconds between two signs of life
-    :param stale: called with each trial that is found stale
-    :raises ConfigError: if it cannot be reached; names the URL without its password
+    :param stale: called with each stale trial
+    :raises ConfigError: if it cannot be reached; shows the URL without its password
     """
     opened = _connected(storage, interval, stale)
     if url_of(storage).get_backend_name() == "sqlite":
@@ -57,9 +57,9 @@ def open_database(storage: str, interval: int, stale: StaleCallback) -> BaseStor
 
 
 def read_database(storage: str) -> BaseStorage:
-    """A database to be looked at; nothing is written.
+    """Open a database for reading; nothing is written.
 
-    :raises ConfigError: if it cannot be reached, or holds no studies
+    :raises ConfigError: if it cannot be reached, or holds no searches
     """
     from sqlalchemy import create_engine, inspect
 
@@ -72,23 +72,22 @@ def read_database(storage: str) -> BaseStorage:
 
     if not _reached(storage, has_studies):
         raise ConfigError(
-            f"there are no studies in {shown_url(storage)}; give the --storage that was tuned with"
+            f"there are no searches in {shown_url(storage)}; give the --storage that was tuned with"
         )
     return _connected(storage, None, None)
 
 
 def _take_locks_first(engine: Any) -> None:
-    """Let each transaction take SQLite's lock before it reads.
+    """Make each transaction take SQLite's lock before it reads.
 
-    To take a trial, to give one up and to number a new one Optuna reads, decides and writes, with
-    the row locked meanwhile. SQLite has no locks of rows: two processes would read the same, and
-    both write.
+    To take, give up or number a trial, Optuna reads, decides and writes with the row locked. SQLite
+    cannot lock rows: two processes would read the same row, and both would write.
     """
     from sqlalchemy import event
 
     @event.listens_for(engine, "begin")
     def begin(connection: Any) -> None:
-        connection.connection.dbapi_connection.isolation_level = None  # no BEGIN of the driver's
+        connection.connection.dbapi_connection.isolation_level = None  # the driver shall not begin
         connection.exec_driver_sql("BEGIN IMMEDIATE")
 
 
@@ -112,9 +111,9 @@ def _connected(storage: str, interval: int | None, stale: StaleCallback | None) 
 
 
 def _reached(storage: str, connect: Callable[[], T]) -> T:
-    """What ``connect`` returns, tried again while other processes make the same tables.
+    """Return what ``connect`` returns; try again while other processes make the same tables.
 
-    :raises ConfigError: if the database cannot be reached; names it without its password
+    :raises ConfigError: if the database cannot be reached; shows its URL without the password
     """
     from sqlalchemy.exc import IntegrityError, OperationalError, ProgrammingError, SQLAlchemyError
 
@@ -131,21 +130,21 @@ def _reached(storage: str, connect: Callable[[], T]) -> T:
             busy = "already exists" in str(cause) or "locked" in str(cause)
             made = isinstance(cause, (IntegrityError, ProgrammingError))
             if attempt < OPENINGS and (made or (isinstance(cause, OperationalError) and busy)):
-                time.sleep(MOMENT)
+                time.sleep(PAUSE)
                 continue
             text = str(getattr(cause, "orig", error)).strip().splitlines()
             raise ConfigError(
                 f"the storage {shown} cannot be reached ({text[0] if text else 'no reason given'}"
-                "); check what the URL says, or leave --storage out for a journal file"
-            ) from None  # whose text may hold the password
-        except RuntimeError as error:  # Optuna: tables of another version
+                "); check the URL, or leave --storage out for a journal file"
+            ) from None  # its text may hold the password
+        except RuntimeError as error:  # tables of another version of Optuna
             raise ConfigError(f"the storage {shown} cannot be used: {error}") from error
     raise AssertionError  # the last attempt returns or raises
 
 
 @contextmanager
 def no_experimental_warnings() -> Iterator[None]:
-    """Within it, Optuna is silent on what it calls experimental."""
+    """Ignore warnings that a feature of Optuna is experimental, within the block."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
         yield

@@ -1,4 +1,4 @@
-"""What a study is: written into it when it is made, compared when it is joined."""
+"""The definition of a search: stored with it when it is made, compared when it is joined."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from sb3_sparse.zoo.settings import method_of, policy_kwargs_of
 from sb3_sparse.zoo.spec import RunSpec
 
 DEFAULT_TRIALS = 100
-NOT_COMPARED = ("run.entry",)  # what the config's file had: that is compared as settings
+NOT_COMPARED = ("run.entry",)  # the config's file; its content is compared as settings
 
 
 @dataclass(frozen=True)
 class Definition:
     """What is tuned, and how.
 
-    :param run: with the first seed of every trial; the samplers' seed too
+    :param run: what is trained; its seed is the first of every trial, and the sampler's
     :param space: what is searched
-    :param seeds: runs a trial
+    :param seeds: runs per trial
     :param sampler: ``"grid"``, ``"tpe"`` or ``"random"``
     :param pruner: ``"none"``, ``"median"``, ``"halving"`` or ``"hyperband"``
-    :raises ConfigError: if these do not go together
+    :raises ConfigError: if these do not fit together
     """
 
     run: RunSpec
@@ -50,7 +50,7 @@ class Definition:
 
     @property
     def default_name(self) -> str:
-        """A study's name where the user gives none."""
+        """The search's name if the user gives none."""
         sparsity = policy_kwargs_of(self.run.settings())["sparsity"]
         shares = sparsity.values() if isinstance(sparsity, Mapping) else [sparsity]
         parts = [self.run.algo, self.run.env_id.replace("/", "-"), self.method]
@@ -60,10 +60,10 @@ class Definition:
         return "_".join([*parts, self.space.name])
 
     def trials(self, wanted: int | None) -> int:
-        """How many trials the study shall have.
+        """Return how many trials the search shall have.
 
         :param wanted: None: every cell of a grid, else 100
-        :raises ConfigError: for less than 1, or more than a grid has cells
+        :raises ConfigError: for fewer than 1, or more than a grid has cells
         """
         grid = self.space.grid if self.sampler == "grid" else None
         cells = prod(len(choices) for choices in grid.values()) if grid else None
@@ -75,24 +75,25 @@ class Definition:
         return wanted
 
     def ticket(self, number: int) -> dict[str, Any]:
-        """System attributes of the waiting trial of that number, as Optuna's samplers read them."""
+        """Return the system attributes of a waiting trial, as Optuna's samplers read them."""
         if self.sampler != "grid":
             return {}
         return {"grid_id": number, "search_space": self.space.grid}
 
     def make_sampler(self) -> optuna.samplers.BaseSampler:
-        """The study's sampler."""
+        """Make the search's sampler."""
         return sampler_of(self.sampler, self.space, self.run.seed)
 
     def make_pruner(self) -> optuna.pruners.BasePruner:
-        """The study's pruner."""
+        """Make the search's pruner."""
         return pruner_of(self.pruner, planned_evaluations(self.run) * self.seeds)
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values, from which :meth:`from_dict` makes the same.
+        """Return plain values, from which :meth:`from_dict` makes the same definition.
 
-        The settings among them are there to be compared, all with one sample of the space: what is
-        searched may change in the config, e.g. by writing the best values into it.
+        The settings among them serve the comparison only. They hold one sample of the space in
+        place of what is searched, which may change in the config, e.g. when the best values are
+        written into it.
         """
         return {
             "run": self.run.as_dict(),
@@ -106,15 +107,18 @@ class Definition:
 
     @staticmethod
     def from_dict(values: Mapping[str, Any]) -> Definition:
-        """What :meth:`as_dict` described."""
-        space = Space.from_dict(values["space"])
-        run = RunSpec(**values["run"])
-        how = (values[name] for name in ("seeds", "sampler", "pruner"))
-        return Definition(run, space, *how)
+        """Make the definition that :meth:`as_dict` described."""
+        return Definition(
+            RunSpec(**values["run"]),
+            Space.from_dict(values["space"]),
+            values["seeds"],
+            values["sampler"],
+            values["pruner"],
+        )
 
 
 def differences(ours: Mapping[str, Any], theirs: Mapping[str, Any], path: str = "") -> list[str]:
-    """Where two definitions differ, in words."""
+    """Describe where two definitions differ."""
     found = []
     for name in sorted(ours.keys() | theirs.keys()):
         here, there = ours.get(name), theirs.get(name)

@@ -1,49 +1,53 @@
-"""Studies in a journal file, which outlives torn writes and dead workers."""
+"""Journal files, which survive torn writes and dead workers."""
 
 from __future__ import annotations
 
 import json
 import os
 import tempfile
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from optuna.storages import JournalStorage
-from optuna.storages._heartbeat import BaseHeartbeat
-from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
-from optuna.storages.journal._file import get_lock_file
+from optuna.storages.journal import (
+    JournalFileBackend,
+    JournalFileOpenLock,
+    JournalFileSymlinkLock,
+)
 
 from sb3_sparse.errors import warn
 from sb3_sparse.tuning.backend import BaseStorage, FrozenTrial, TrialState
+from sb3_sparse.tuning.internals import SignsOfLife, id_of
 from sb3_sparse.tuning.queue import FromQueue, StaleCallback
 
 RECORD = b'{"op_code":'  # how Optuna begins each line
 
 
 class JournalFile(JournalFileBackend):
-    """Optuna's journal, but a line that was not written to its end harms no other.
+    """A journal in which an unfinished line harms no other.
 
-    A full disk or a power cut can leave half a line. Optuna writes the next record behind it, and
-    can read the journal no more. Here such a tail moves into ``<journal>.torn``.
+    A full disk or a power cut can leave half a line. Optuna would write the next record behind it,
+    and could not read the journal any more. Here the half line moves into ``<journal>.torn``.
 
-    :param path: of the journal; made if it is new
-    :raises ValueError: if the file is no journal, or damaged before its last line; then it stays
-        as it is
+    :param path: of the journal; a new one is made
+    :raises ValueError: if the file is not a journal, or is damaged before its last line; the file
+        then stays as it is
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        lock = JournalFileOpenLock(str(path)) if os.name == "nt" else None
-        super().__init__(str(path), lock)
-        with get_lock_file(self._lock):
+        kind = JournalFileOpenLock if os.name == "nt" else JournalFileSymlinkLock
+        self.lock = kind(str(path))
+        super().__init__(str(path), self.lock)
+        with self._locked():
             self._set_aside(_damaged_from(path))
 
     def append_logs(self, logs: list[dict[str, Any]]) -> None:
-        """Append records, all or none."""
+        """Append all records, or none."""
         lines = "".join(f"{json.dumps(log, separators=(',', ':'))}\n" for log in logs)
-        with get_lock_file(self._lock):
+        with self._locked():
             self._set_aside(_torn_from(self.path))
             with self.path.open("ab", buffering=0) as file:
                 end = file.tell()
@@ -56,8 +60,16 @@ class JournalFile(JournalFileBackend):
                     file.truncate(end)
                     raise
 
+    @contextmanager
+    def _locked(self) -> Iterator[None]:
+        self.lock.acquire()
+        try:
+            yield
+        finally:
+            self.lock.release()
+
     def _set_aside(self, position: int | None) -> None:
-        """Move what lies behind a position into a file beside, and say so."""
+        """Move everything behind a position into a file beside the journal, with a warning."""
         if position is None:
             return
         aside = self.path.with_name(f"{self.path.name}.torn")
@@ -72,13 +84,13 @@ class JournalFile(JournalFileBackend):
             os.fsync(file.fileno())
         warn(
             f"the last line of the journal {self.path} was not written to its end, as after a "
-            f"power cut or on a full disk; its {len(tail)} bytes are in {aside} now, and the study "
-            "goes on without them"
+            f"power cut or on a full disk; its {len(tail)} bytes are in {aside} now, and the "
+            "search continues without them"
         )
 
 
 def _torn_from(path: Path) -> int | None:
-    """Where a last line without an end begins; None if the file ends well."""
+    """Return where a last line without an end begins; None if the last line has one."""
     with path.open("rb") as file:
         size = file.seek(0, os.SEEK_END)
         if size == 0:
@@ -91,9 +103,9 @@ def _torn_from(path: Path) -> int | None:
 
 
 def _damaged_from(path: Path) -> int | None:
-    """Where a damaged last line begins; None if all lines are records.
+    """Return where a damaged last line begins; None if all lines are records.
 
-    :raises ValueError: if another line is damaged, or nothing shows that this is a journal
+    :raises ValueError: if another line is damaged, or if the file does not look like a journal
     """
     position = 0
     with path.open("rb") as file:
@@ -102,7 +114,7 @@ def _damaged_from(path: Path) -> int | None:
             following = file.readline()
             if not _is_record(line, parse=not following):
                 if following or (number == 1 and not RECORD.startswith(line[: len(RECORD)])):
-                    raise ValueError(f"its line {number} is no record of Optuna")
+                    raise ValueError(f"its line {number} is not a record of Optuna")
                 return position
             position += len(line)
             line, number = following, number + 1
@@ -118,15 +130,15 @@ def _is_record(line: bytes, parse: bool) -> bool:
         return False
 
 
-class QueueJournal(FromQueue, JournalStorage, BaseHeartbeat):
-    """A journal file, with what Optuna has for databases alone: signs of life.
+class QueueJournal(FromQueue, JournalStorage, SignsOfLife):
+    """A journal file with signs of life, which Optuna has for databases only.
 
-    A worker touches a file of its trial in ``<journal>.alive/``; a trial whose file has not been
+    A worker touches the file of its trial in ``<journal>.alive/``. A trial whose file has not been
     touched for ``3 * interval`` is stale.
 
     :param path: of the journal
     :param interval: seconds between two signs of life
-    :param stale: called with each trial that is found stale
+    :param stale: called with each stale trial
     """
 
     def __init__(self, path: Path, interval: int, stale: StaleCallback) -> None:
@@ -136,63 +148,59 @@ class QueueJournal(FromQueue, JournalStorage, BaseHeartbeat):
         self._interval, self._stale = interval, stale
 
     def record_heartbeat(self, trial_id: int) -> None:
-        """Touch the trial's file; where that fails, the next time will do."""
+        """Touch the trial's file; if that fails, the next sign will do."""
         with suppress(OSError):
             (self._alive / str(trial_id)).touch()
 
     def set_trial_state_values(
         self, trial_id: int, state: TrialState, values: Sequence[float] | None = None
     ) -> bool:
-        """As in Optuna; a trial that is over needs no file."""
+        """Set the state as Optuna does, and remove the file of a trial that has ended."""
         changed = super().set_trial_state_values(trial_id, state, values)
         if state.is_finished():
             (self._alive / str(trial_id)).unlink(missing_ok=True)
         return changed
 
-    def _get_stale_trial_ids(self, study_id: int) -> list[int]:
+    def stale_trials(self, study_id: int) -> list[FrozenTrial]:
         with tempfile.TemporaryFile(dir=self._alive) as new:
-            now = os.fstat(new.fileno()).st_mtime  # by the clock of the files, whoever asks
+            now = os.fstat(new.fileno()).st_mtime  # the file system's clock, on any machine
         running = self.get_all_trials(study_id, deepcopy=False, states=(TrialState.RUNNING,))
-        return [
-            trial._trial_id
-            for trial in running
-            if now - self._last_sign(trial) > 3 * self._interval
-        ]
+        return [trial for trial in running if now - self._last_sign(trial) > 3 * self._interval]
 
     def _last_sign(self, trial: FrozenTrial) -> float:
         try:
-            return (self._alive / str(trial._trial_id)).stat().st_mtime
-        except FileNotFoundError:  # taken this moment, or killed before its first sign
+            return (self._alive / str(id_of(trial))).stat().st_mtime
+        except FileNotFoundError:  # just taken, or its worker was killed before its first sign
             assert trial.datetime_start is not None
             return trial.datetime_start.timestamp()
 
     def get_heartbeat_interval(self) -> int | None:
-        """Seconds between two signs of life."""
+        """Return the seconds between two signs of life."""
         return self._interval
 
     def get_heartbeat_stale_trial_callback(self) -> StaleCallback | None:
-        """What is called with each stale trial."""
+        """Return the function that is called with each stale trial."""
         return self._stale
 
     get_failed_trial_callback = get_heartbeat_stale_trial_callback
 
 
 def open_journal(path: Path, interval: int, stale: StaleCallback) -> BaseStorage:
-    """A journal that workers take trials from, made if it is new.
+    """Open a journal that workers take trials from; a new one is made.
 
     :param path: of the file
     :param interval: seconds between two signs of life
-    :param stale: called with each trial that is found stale
-    :raises ValueError: if it is damaged before its last line, or no journal
+    :param stale: called with each stale trial
+    :raises ValueError: if it is damaged before its last line, or is not a journal
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     return QueueJournal(path, interval, stale)
 
 
 def read_journal(path: Path) -> BaseStorage:
-    """A journal to be looked at; nothing is written, and half a last line is passed over.
+    """Open a journal for reading; nothing is written, and half a last line is skipped.
 
-    :raises ValueError: if it is damaged before its last line, or no journal
+    :raises ValueError: if it is damaged before its last line, or is not a journal
     """
     _damaged_from(path)
     return JournalStorage(JournalFileBackend(str(path)))

@@ -1,4 +1,4 @@
-"""What a trial does: train with sampled values, once for each seed."""
+"""The objective of a search: train with sampled values, once for each seed."""
 
 from __future__ import annotations
 
@@ -30,19 +30,33 @@ class Objective:
     """An objective for ``optuna.Study.optimize``, to be maximized.
 
     A trial samples the space and trains the run with ``seed``, ``seed + 1``, ... one after the
-    other; all trials have the same seeds. Its value is the mean of their scores, each the mean
-    return of the last 10 % of evaluations. After each evaluation it reports the mean over the seeds
-    so far, at steps 1, 2, ... of all its evaluations, and asks the study's pruner.
+    other; all trials have the same seeds. Its value is the mean of their scores, where a score is
+    the mean return of the last 10 % of evaluations. After each evaluation the trial reports the
+    mean over the seeds so far, at steps 1, 2, ... of all its evaluations, and asks the study's
+    pruner.
 
     Each seed leaves a run's folder in ``folder/<trial number>/<algo>``, and the trial has the user
-    attributes ``hyperparams`` (what was sampled), ``scores`` (one a seed), ``worker`` and
+    attributes ``hyperparams`` (the sampled values), ``scores`` (one per seed), ``worker`` and
     ``seconds``.
 
     :param run: what is tuned
     :param space: what is sampled; see :func:`sb3_sparse.tuning.space_of`
-    :param seeds: how many runs a trial
+    :param seeds: runs per trial
     :param folder: where the trials' folders go
     :raises ConfigError: for less than one seed, or runs without any evaluation
+
+    Example::
+
+        import optuna
+
+        from sb3_sparse.tuning import Objective, Space
+        from sb3_sparse.zoo.spec import RunSpec
+
+        run = RunSpec("dqn", "CartPole-v1", method="rigl", n_timesteps=200, eval_freq=100)
+        decays = optuna.distributions.CategoricalDistribution([0.0, 1e-4])
+        study = optuna.create_study(direction="maximize")
+        study.optimize(Objective(run, Space("mine", {"weight_decay": decays})), n_trials=1)
+        print(study.best_params, study.best_value)
     """
 
     def __init__(
@@ -55,8 +69,8 @@ class Objective:
     def __call__(self, trial: Trial) -> float:
         """Train, and return the mean score of the seeds.
 
-        :raises optuna.TrialPruned: where the study's pruner says so, or training diverges
-        :raises KeyboardInterrupt: after SIGINT or SIGTERM, when the rollout at hand is over
+        :raises optuna.TrialPruned: if the study's pruner stops the trial, or if training diverges
+        :raises KeyboardInterrupt: after SIGINT or SIGTERM, at the end of the current rollout
         """
         began = time.monotonic()
         values = self.space.sample(trial)
@@ -87,18 +101,18 @@ class Objective:
 
 
 def check_seeds(seeds: int) -> None:
-    """Refuse a number of runs a trial that is none.
+    """Check the number of runs per trial.
 
-    :raises ConfigError: if so
+    :raises ConfigError: if it is out of range
     """
     if not 1 <= seeds <= MAX_SEEDS:
         raise ConfigError(f"seeds must lie in [1, {MAX_SEEDS}], got {seeds}")
 
 
 def planned_evaluations(run: RunSpec) -> int:
-    """How many evaluations a run has.
+    """Return how many evaluations a run has.
 
-    :raises ConfigError: if there is none
+    :raises ConfigError: if it has none
     """
     steps, every = run.settings()["n_timesteps"], run.evaluation()["eval_freq"]
     if steps < every:
@@ -110,12 +124,12 @@ def planned_evaluations(run: RunSpec) -> int:
 
 
 class _Report(BaseCallback):
-    """Tells the study of an evaluation, and stops the run where its pruner wants that.
+    """A callback that reports each evaluation to the study, whose pruner may stop the run.
 
-    :param trial: whose run this is
-    :param scores: of its seeds that are done
+    :param trial: the trial that the run belongs to
+    :param scores: of the seeds that are done
     :param planned: evaluations of one seed
-    :param seeds: of the trial
+    :param seeds: runs of the trial
     """
 
     parent: Evaluation

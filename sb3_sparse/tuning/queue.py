@@ -1,4 +1,4 @@
-"""Storages that give out the trials that wait in a study, and make none."""
+"""Storages that hand out waiting trials only."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ StaleCallback = Callable[["optuna.Study", FrozenTrial], None]
 
 
 class QueueEmpty(Exception):
-    """There is no trial left to take."""
+    """No trial waits any more."""
 
 
 class FromQueue(BaseStorage):
-    """Gives out the trials that wait in a study, and never makes one for a worker that asks.
+    """A storage that hands out waiting trials, and never makes one for a worker that asks.
 
-    A study holds its whole budget as waiting trials. Every storage takes one in a single atomic
-    step, so no trial is trained twice, whatever the sampler and however many workers there are.
+    A search holds its whole budget as waiting trials. Every storage takes one in a single atomic
+    step, so no trial is trained twice, with any sampler and any number of workers.
     """
 
     def create_new_trial(self, study_id: int, template_trial: FrozenTrial | None = None) -> int:
-        """As in Optuna, but only with a template.
+        """Make a trial from a template, as Optuna does.
 
-        :raises QueueEmpty: without
+        :raises QueueEmpty: without a template, when a worker asks and no trial waits
         """
         if template_trial is None:
             raise QueueEmpty
@@ -36,9 +36,9 @@ class FromQueue(BaseStorage):
         deepcopy: bool = True,
         states: Container[TrialState] | None = None,
     ) -> list[FrozenTrial]:
-        """As in Optuna, but those that wait come in the order that they were planned in.
+        """Return trials as Optuna does, but waiting ones in the order of the plan.
 
-        So what was lost or interrupted is trained before what has not been begun.
+        So trials that were lost or interrupted are trained before those that never began.
         """
         trials = super().get_all_trials(study_id, deepcopy, states)  # type: ignore[safe-super]
         if states != (TrialState.WAITING,):

@@ -1,4 +1,4 @@
-"""One HTML page on studies: history, importances, slices, the best of each method; and a CSV."""
+"""An HTML page on searches: history, importances, slices, the best of each method; and a CSV."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from sb3_sparse.pages.table import Table
 from sb3_sparse.tuning.backend import BaseStorage, FrozenTrial, TrialState, optuna, quiet_optuna
 from sb3_sparse.tuning.definition import Definition
 from sb3_sparse.tuning.objective import VALUES
+from sb3_sparse.tuning.search import DEFINITION, Search, folder_name
 from sb3_sparse.tuning.spaces import with_values
 from sb3_sparse.tuning.storage import FOLDER, JOURNAL, open_existing
-from sb3_sparse.tuning.study import DEFINITION, definition_of, find_study, folder_name, status_of
 from sb3_sparse.tuning.urls import shown_url
 from sb3_sparse.zoo.settings import policy_kwargs_of
 
@@ -29,7 +29,7 @@ try:
         plot_slice,
     )
 except ImportError as error:
-    raise MissingExtra("reports on studies", "tune") from error
+    raise MissingExtra("reports on searches", "tune") from error
 
 TOP = 10
 HEIGHT = 420
@@ -46,62 +46,63 @@ FIGURES: dict[str, Callable[[optuna.Study], Any]] = {
 def write_report(studies: Sequence[optuna.Study], storage: BaseStorage, path: Path) -> Path:
     """Write a page that opens without a network, and beside it a CSV of all trials.
 
-    :param studies: what it is about
-    :param storage: where other studies of the same algorithm and environment are looked up, for the
-        table of the best of each method
+    :param studies: Optuna's studies of the searches, e.g. :attr:`Tuned.study`
+    :param storage: where other searches for the same algorithm and environment are looked up, for
+        the table of the best of each method
     :param path: of the page; the CSV has its name with ``.csv``
     :return: the page
-    :raises ConfigError: if a study has no completed trial
+    :raises ConfigError: if a search has no completed trial
     """
-    for study in studies:
-        if not status_of(study).complete:
+    searches = [Search(study) for study in studies]
+    for search in searches:
+        if not search.status().complete:
             raise ConfigError(
-                f"no trial of {study.study_name!r} was completed yet, so there is nothing to report"
+                f"no trial of {search.name!r} was completed yet, so there is nothing to report"
             )
-    title = "Tuning: " + ", ".join(study.study_name for study in studies)
-    parts = [_best_by_method(studies, storage), *map(_about, studies)]
+    title = "Tuning: " + ", ".join(search.name for search in searches)
+    parts = [_best_by_method(searches, storage), *map(_about, searches)]
     page = html.page(title, parts, script=plotly.offline.get_plotlyjs())
     path.parent.mkdir(parents=True, exist_ok=True)
     with written_whole(path) as new:
         new.write_text(page, encoding="utf-8")
-    _write_csv(studies, path.with_suffix(".csv"))
+    _write_trials(searches, path.with_suffix(".csv"))
     return path
 
 
 @quiet_optuna()
-def report_on(
+def report_by_name(
     names: Sequence[str], storage: str | Path | None, log_folder: Path, path: Path | None
 ) -> Path:
-    """Write the page on studies by their names.
+    """Write the page on searches, given by their names.
 
     :param storage: as in :func:`tune`
-    :param path: of the page; None: ``report.html`` in the first study's folder
+    :param path: of the page; None: ``report.html`` in the first search's folder
     :return: the page
-    :raises ConfigError: if there is no such study, or no completed trial in one
+    :raises ConfigError: if a search does not exist, or has no completed trial
     """
     storage = storage or log_folder / FOLDER / JOURNAL
     opened = open_existing(storage)
-    studies = [find_study(opened, name, shown_url(storage)) for name in names]
+    studies = [Search.find(opened, name, shown_url(storage)).study for name in names]
     folder = log_folder / FOLDER / folder_name(names[0])
     return write_report(studies, opened, path or folder / "report.html")
 
 
-def _about(study: optuna.Study) -> str:
-    definition, status = definition_of(study), status_of(study)
+def _about(search: Search) -> str:
+    definition, status = search.definition, search.status()
     pruned = len(status.done) - len(status.complete)
     run = definition.run
     facts = [
         f"{run.algo.upper()} on {run.env_id}, {_what(definition, status.best)}",
-        f"{run.settings()['n_timesteps']} steps, {definition.seeds} seed(s) a trial",
+        f"{run.settings()['n_timesteps']} steps, {definition.seeds} seed(s) per trial",
         f"sampler {definition.sampler}, pruner {definition.pruner}",
         f"{len(status.complete)} completed, {pruned} pruned, {len(status.failed)} failed, of "
         f"{status.planned} planned",
     ]
     return html.section(
-        study.study_name,
+        search.name,
         html.paragraph(f"{'; '.join(facts)}."),
         html.subsection(f"The {TOP} best trials", _top(status.complete)),
-        *(html.subsection(title, *_figure(draw, study)) for title, draw in FIGURES.items()),
+        *(html.subsection(title, *_figure(draw, search.study)) for title, draw in FIGURES.items()),
     )
 
 
@@ -119,7 +120,7 @@ def _figure(draw: Callable[[optuna.Study], Any], study: optuna.Study) -> list[st
 
 
 def _what(definition: Definition, best: FrozenTrial | None) -> str:
-    """Method and sparsity; where the sparsity is searched, that of the best trial."""
+    """Return method and sparsity; a searched sparsity is that of the best trial."""
     if definition.method == "dense":
         return "dense"
     run = definition.run if best is None else with_values(definition.run, best.user_attrs[VALUES])
@@ -142,16 +143,16 @@ def _scores(trial: FrozenTrial) -> str:
     return ", ".join(f"{score:.6g}" for score in trial.user_attrs.get("scores", []))
 
 
-def _best_by_method(studies: Sequence[optuna.Study], storage: BaseStorage) -> str:
-    tasks = {_task(definition_of(study)) for study in studies}
+def _best_by_method(searches: Sequence[Search], storage: BaseStorage) -> str:
+    tasks = {_task(search.definition) for search in searches}
     rows, unread = [], []
     for summary in storage.get_all_studies():
         if DEFINITION not in summary.user_attrs:
             continue
-        study = optuna.load_study(storage=storage, study_name=summary.study_name)
+        search = Search.find(storage, summary.study_name, "the storage")
         try:
-            definition, status = definition_of(study), status_of(study)
-        except SparsityError as error:  # e.g. of an environment or method that is not here
+            definition, status = search.definition, search.status()
+        except SparsityError as error:  # e.g. of an environment or method that is missing here
             unread.append(html.paragraph(f"Left out: {summary.study_name}: {error}"))
             continue
         if _task(definition) not in tasks or status.best is None:
@@ -160,9 +161,9 @@ def _best_by_method(studies: Sequence[optuna.Study], storage: BaseStorage) -> st
         row = [*_task(definition), _what(definition, status.best), status.best.values[0]]
         shown = ", ".join(f"{name} {value}" for name, value in values.items())
         row += [shown, f"{len(status.complete)} of {status.planned}", definition.seeds]
-        rows.append([*row, study.study_name])
+        rows.append([*row, search.name])
     heads = ["algorithm", "environment", "steps", "method", "best score", "with", "completed"]
-    table = Table([*heads, "seeds a trial", "study"], sorted(rows, key=str), DIGITS)
+    table = Table([*heads, "seeds per trial", "search"], sorted(rows, key=str), DIGITS)
     return html.section("Best of each method", html.table(table), *unread)
 
 
@@ -171,16 +172,16 @@ def _task(definition: Definition) -> tuple[str, str, int]:
     return run.algo, run.env_id, run.settings()["n_timesteps"]
 
 
-def _write_csv(studies: Sequence[optuna.Study], path: Path) -> None:
-    """A row a trial: what it was, its values, score, scores of the seeds, seconds."""
-    trials = [(study, trial) for study in studies for trial in status_of(study).all]
+def _write_trials(searches: Sequence[Search], path: Path) -> None:
+    """Write a row for each trial: its state, values, score, the seeds' scores, its seconds."""
+    trials = [(search, trial) for search in searches for trial in search.status().all]
     names = sorted({name for _, trial in trials for name in trial.params})
     heads = ["study", "trial", "state", "score", *names, "scores", "evaluations", "seconds"]
     rows = []
-    for study, trial in trials:
+    for search, trial in trials:
         value = trial.values[0] if trial.state == TrialState.COMPLETE else None
         params = [trial.params.get(name) for name in names]
-        row = [study.study_name, trial.number, trial.state.name.lower(), value, *params]
+        row = [search.name, trial.number, trial.state.name.lower(), value, *params]
         scores = " ".join(f"{score:.6g}" for score in trial.user_attrs.get("scores", []))
         seconds = trial.user_attrs.get("seconds")
         rows.append([*row, scores, len(trial.intermediate_values), seconds])

@@ -2,51 +2,114 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from sb3_sparse.errors import ConfigError
-from sb3_sparse.tuning.backend import BaseDistribution, FrozenTrial, TrialState, optuna
-from sb3_sparse.tuning.choices import PRUNERS, SAMPLERS, check_choice
+from sb3_sparse.tuning.backend import FrozenTrial, optuna
+from sb3_sparse.tuning.choices import check_choice
 from sb3_sparse.tuning.spaces import Space
 
 BaseSampler = optuna.samplers.BaseSampler
-TICKET = "sb3_sparse:ticket"  # which of the study's planned trials a trial is an attempt at
+BasePruner = optuna.pruners.BasePruner
+TICKET = "sb3_sparse:ticket"  # which of the planned trials a trial is an attempt at
 STARTUP_TRIALS = 5
 REDUCTION = 3
 
 
 def sampler_of(name: str, space: Space, seed: int) -> BaseSampler:
-    """A sampler whose choice for a trial depends on seed, trial number and earlier trials alone.
+    """Make a sampler whose choices depend on seed, trial number and earlier trials only.
 
-    So a study that was interrupted goes on as if it had not been, and workers need no seeds of
-    their own.
+    So an interrupted search continues as if it had not been interrupted, and workers need no seeds
+    of their own.
 
     :param name: ``"grid"``, ``"tpe"`` or ``"random"``
-    :raises ConfigError: for another name, or a grid over something that has no choices
+    :raises ConfigError: for another name, or for a grid over a space without choices
     """
-    check_choice("sampler", name, SAMPLERS)
-    if name == "grid":
-        if space.grid is None:
-            raise ConfigError(
-                f"a grid needs choices, and the space {space.name!r} has ranges or a function; "
-                "take --sampler tpe or random, or lists in the space"
-            )
-        return optuna.samplers.GridSampler(space.grid, seed=seed)
-    if name == "random":
-        return SeededByTrial(lambda s: optuna.samplers.RandomSampler(seed=s), seed)
-    return SeededByTrial(
-        lambda s: optuna.samplers.TPESampler(seed=s, constant_liar=True, n_startup_trials=10), seed
+    check_choice("sampler", name, tuple(SAMPLERS))
+    return SAMPLERS[name](space, seed)
+
+
+def _grid(space: Space, seed: int) -> BaseSampler:
+    if space.grid is None:
+        raise ConfigError(
+            f"a grid needs choices, and the space {space.name!r} has ranges or a function; "
+            "take --sampler tpe or random, or lists in the space"
+        )
+    return optuna.samplers.GridSampler(space.grid, seed=seed)
+
+
+def _tpe(space: Space, seed: int) -> BaseSampler:
+    def make(seed: int) -> BaseSampler:
+        return optuna.samplers.TPESampler(seed=seed, constant_liar=True, n_startup_trials=10)
+
+    return SeededByTrial(make, seed)
+
+
+def _random(space: Space, seed: int) -> BaseSampler:
+    return SeededByTrial(lambda seed: optuna.samplers.RandomSampler(seed=seed), seed)
+
+
+SAMPLERS: dict[str, Callable[[Space, int], BaseSampler]] = {
+    "grid": _grid,
+    "tpe": _tpe,
+    "random": _random,
+}
+
+
+def pruner_of(name: str, evaluations: int) -> BasePruner:
+    """Make a pruner for trials that report a given number of evaluations.
+
+    :param name: ``"none"``, ``"median"`` (after five whole trials, not in a trial's first third),
+        ``"halving"`` (asynchronous successive halving: the best third continues after a ninth and
+        after a third of the evaluations) or ``"hyperband"``
+    :param evaluations: of a whole trial, over all its seeds
+    :raises ConfigError: for another name
+    """
+    check_choice("pruner", name, tuple(PRUNERS))
+    return PRUNERS[name](evaluations)
+
+
+def _none(evaluations: int) -> BasePruner:
+    return optuna.pruners.NopPruner()
+
+
+def _median(evaluations: int) -> BasePruner:
+    return optuna.pruners.MedianPruner(STARTUP_TRIALS, n_warmup_steps=evaluations // 3)
+
+
+def _halving(evaluations: int) -> BasePruner:
+    return optuna.pruners.SuccessiveHalvingPruner(
+        min_resource=_first_rung(evaluations), reduction_factor=REDUCTION
     )
 
 
+def _hyperband(evaluations: int) -> BasePruner:
+    least = _first_rung(evaluations)
+    return optuna.pruners.HyperbandPruner(
+        min_resource=least, max_resource=max(evaluations, least), reduction_factor=REDUCTION
+    )
+
+
+def _first_rung(evaluations: int) -> int:
+    return max(1, evaluations // REDUCTION**2)
+
+
+PRUNERS: dict[str, Callable[[int], BasePruner]] = {
+    "none": _none,
+    "median": _median,
+    "halving": _halving,
+    "hyperband": _hyperband,
+}
+
+
 class SeededByTrial(BaseSampler):
-    """Makes a sampler anew for each trial, with a seed of its own.
+    """A sampler that is made anew for each trial, with a seed of its own.
 
     :param make: makes a sampler from a seed
-    :param seed: of the study
+    :param seed: of the search
     """
 
     def __init__(self, make: Callable[[int], BaseSampler], seed: int) -> None:
@@ -60,61 +123,18 @@ class SeededByTrial(BaseSampler):
         self._sampler = self._make(int(words[0]))
         self._sampler.before_trial(study, trial)
 
-    def infer_relative_search_space(
-        self, study: optuna.Study, trial: FrozenTrial
-    ) -> dict[str, BaseDistribution]:
-        """As the trial's sampler does."""
-        return self._sampler.infer_relative_search_space(study, trial)
+    def infer_relative_search_space(self, *args: Any, **kwargs: Any) -> Any:
+        """Ask the trial's sampler."""
+        return self._sampler.infer_relative_search_space(*args, **kwargs)
 
-    def sample_relative(
-        self,
-        study: optuna.Study,
-        trial: FrozenTrial,
-        search_space: dict[str, BaseDistribution],
-    ) -> dict[str, Any]:
-        """As the trial's sampler does."""
-        return self._sampler.sample_relative(study, trial, search_space)
+    def sample_relative(self, *args: Any, **kwargs: Any) -> Any:
+        """Ask the trial's sampler."""
+        return self._sampler.sample_relative(*args, **kwargs)
 
-    def sample_independent(
-        self,
-        study: optuna.Study,
-        trial: FrozenTrial,
-        param_name: str,
-        param_distribution: BaseDistribution,
-    ) -> Any:
-        """As the trial's sampler does."""
-        return self._sampler.sample_independent(study, trial, param_name, param_distribution)
+    def sample_independent(self, *args: Any, **kwargs: Any) -> Any:
+        """Ask the trial's sampler."""
+        return self._sampler.sample_independent(*args, **kwargs)
 
-    def after_trial(
-        self,
-        study: optuna.Study,
-        trial: FrozenTrial,
-        state: TrialState,
-        values: Sequence[float] | None,
-    ) -> None:
-        """As the trial's sampler does."""
-        self._sampler.after_trial(study, trial, state, values)
-
-
-def pruner_of(name: str, evaluations: int) -> optuna.pruners.BasePruner:
-    """A pruner for trials that report so many evaluations.
-
-    :param name: ``"none"``, ``"median"`` (after five whole trials, not in a trial's first third),
-        ``"halving"`` (asynchronous successive halving: the best third goes on after a ninth of the
-        evaluations, and after a third) or ``"hyperband"``
-    :param evaluations: of a whole trial, over all its seeds
-    :raises ConfigError: for another name
-    """
-    check_choice("pruner", name, PRUNERS)
-    if name == "none":
-        return optuna.pruners.NopPruner()
-    if name == "median":
-        return optuna.pruners.MedianPruner(STARTUP_TRIALS, n_warmup_steps=evaluations // 3)
-    least = max(1, evaluations // REDUCTION**2)
-    if name == "halving":
-        return optuna.pruners.SuccessiveHalvingPruner(
-            min_resource=least, reduction_factor=REDUCTION
-        )
-    return optuna.pruners.HyperbandPruner(
-        min_resource=least, max_resource=max(evaluations, least), reduction_factor=REDUCTION
-    )
+    def after_trial(self, *args: Any, **kwargs: Any) -> None:
+        """Tell the trial's sampler."""
+        self._sampler.after_trial(*args, **kwargs)

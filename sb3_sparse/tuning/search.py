@@ -1,203 +1,196 @@
-"""A whole tuning: checks, study, workers, best values."""
+"""Searches in a storage: made, joined, filled with waiting trials, looked at."""
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import closing, contextmanager, suppress
-from dataclasses import dataclass, replace
-from pathlib import Path
-from platform import node
+import json
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
-from sb3_sparse.errors import ConfigError, TuningFailed
-from sb3_sparse.launch import Launcher, Task, check_workers, launcher_named
-from sb3_sparse.tuning.backend import FrozenTrial, optuna, quiet_optuna
-from sb3_sparse.tuning.best import BEST, write_best
-from sb3_sparse.tuning.definition import Definition
-from sb3_sparse.tuning.spacefile import space_of
-from sb3_sparse.tuning.spaces import Space
-from sb3_sparse.tuning.storage import FOLDER, HEARTBEAT, JOURNAL, open_storage
-from sb3_sparse.tuning.study import ERROR, Status, enter_study, folder_name, status_of
-from sb3_sparse.tuning.urls import is_journal, shown_url
-from sb3_sparse.zoo.prepare import prepare
-from sb3_sparse.zoo.spec import RunSpec
+from sb3_sparse.errors import ConfigError
+from sb3_sparse.tuning.backend import BaseStorage, FrozenTrial, TrialState, optuna, quiet_optuna
+from sb3_sparse.tuning.definition import Definition, differences
+from sb3_sparse.tuning.lock import locked
+from sb3_sparse.tuning.objective import VALUES
+from sb3_sparse.tuning.samplers import TICKET
+from sb3_sparse.tuning.spaces import with_values
 
-TRIALS = "trials"
-WORK = "sb3_sparse.tuning.worker:work"
-Watcher = Callable[[Status], None]
+DEFINITION = "sb3_sparse:definition"
+FILLED = "sb3_sparse:trials"
+ERROR = "error"
+DONE = (TrialState.COMPLETE, TrialState.PRUNED)
+ALIVE = (TrialState.WAITING, TrialState.RUNNING)
 
 
 @dataclass(frozen=True)
-class Tuned:
-    """What came out.
+class SearchStatus:
+    """How far a search is.
 
-    :param study: Optuna's, to be looked at further
-    :param status: how far it is
-    :param folder: with the trials' folders, the workers' logs and ``best.yml``
-    :param config: YAML file with the best values; None if no trial was completed
-    :param began: whether anything was left to do
-    :param errors: of workers that ended badly, by name
+    :param all: every trial that was begun, including lost and failed attempts
+    :param planned: how many trials the search shall have
+    :param done: trials that were completed or pruned, in the order of their numbers
+    :param running: trials at work, or lost without anyone having noticed yet
+    :param failed: the last attempts at planned trials, where these failed
     """
 
-    study: optuna.Study
-    status: Status
-    folder: Path
-    config: Path | None
-    began: bool
-    errors: Mapping[str, str]
+    all: tuple[FrozenTrial, ...]
+    planned: int
+    done: tuple[FrozenTrial, ...]
+    running: tuple[FrozenTrial, ...]
+    failed: tuple[FrozenTrial, ...]
+
+    @property
+    def complete(self) -> tuple[FrozenTrial, ...]:
+        """The trials that have a value."""
+        return tuple(trial for trial in self.done if trial.state == TrialState.COMPLETE)
 
     @property
     def best(self) -> FrozenTrial | None:
-        """The best trial; its ``params`` are the best values, ``values[0]`` the score."""
-        return self.status.best
+        """The completed trial with the highest value; the first of several."""
+        return max(self.complete, key=lambda trial: trial.values[0], default=None)
+
+    @property
+    def finished(self) -> bool:
+        """Whether every planned trial is done."""
+        return len({ticket_of(trial) for trial in self.done}) >= self.planned
 
 
-@quiet_optuna()
-def tune(
-    run: RunSpec,
-    space: str | Space = "paper",
-    *,
-    trials: int | None = None,
-    seeds: int = 1,
-    sampler: str | None = None,
-    pruner: str | None = None,
-    name: str | None = None,
-    storage: str | Path | None = None,
-    log_folder: Path = Path("logs"),
-    workers: int = 1,
-    launcher: str | Launcher = "local",
-    heartbeat: int = HEARTBEAT,
-    watch: Watcher | None = None,
-) -> Tuned:
-    """Search hyperparameters; join the study if it exists, and do nothing if it is finished.
+class Search:
+    """A search for hyperparameters, which a study of Optuna's holds.
 
-    Every planned trial is trained once, however many workers, on however many machines, take part;
-    what a killed worker was at is trained again by another.
-
-    :param run: what is tuned, with the first seed
-    :param space: ``"paper"``, ``"wide"``, a file (:func:`space_of`), or a space
-    :param trials: how many; None: every cell of a grid, else 100
-    :param seeds: runs a trial; its value is their mean score
-    :param sampler: ``"grid"``, ``"tpe"`` or ``"random"``; None: a grid where all parameters have
-        choices, else TPE
-    :param pruner: ``"none"``, ``"median"``, ``"halving"`` or ``"hyperband"``; None: none for a
-        grid, else median
-    :param name: of the study; None: algorithm, environment, method, sparsity and space
-    :param storage: path of a journal file or URL of a database; None: ``tune/journal.log`` in
-        ``log_folder``
-    :param log_folder: where ``tune/<name>`` is made
-    :param workers: how many trials at once
-    :param launcher: ``"local"``, ``"ray"`` or one of one's own
-    :param heartbeat: seconds between two signs of life of a worker; one that gives none for three
-        of them is taken for dead
-    :param watch: called with the study's status, about once in a second
-    :raises ConfigError: for a value that is not allowed, a storage that cannot be reached, or
-        another study of the same name; before anything is trained
-    :raises TuningFailed: if every trial failed; with the first one's reason
+    :param study: made by :meth:`enter`
     """
-    check_workers(workers)
-    chosen = launcher_named(launcher) if isinstance(launcher, str) else launcher
-    definition = define(run, space, seeds, sampler, pruner, log_folder)
-    name = definition.default_name if name is None else _checked(name)
-    number = definition.trials(trials)
-    storage = storage or log_folder / FOLDER / JOURNAL
-    folder = log_folder / FOLDER / folder_name(name)
-    opened = open_storage(storage, heartbeat)
-    errors: dict[str, str] = {}
-    with _in_reach(storage):
-        study = enter_study(opened, name, definition, number)
-        began = not status_of(study).finished
-    if began:
-        tasks = _tasks(storage, name, folder, workers, heartbeat)
-        with closing(chosen.run(tasks, workers)) as endings:
-            for ended in endings:
-                if ended is not None and ended.error is not None:
-                    errors[ended.task.name] = ended.error
-                if watch is not None:
-                    with suppress(optuna.exceptions.StorageInternalError):  # the workers go on
-                        watch(status_of(study))
-    with _in_reach(storage):
-        status = status_of(study)
-        config = write_best(study, folder / BEST) if status.best is not None else None
-    _check_outcome(name, status, folder, errors)
-    return Tuned(study, status, folder, config, began, errors)
 
+    def __init__(self, study: optuna.Study) -> None:
+        self.study = study
 
-def _check_outcome(name: str, status: Status, folder: Path, errors: Mapping[str, str]) -> None:
-    """Raise if nothing came out, and nobody is at work any more."""
-    if status.done or status.running or not (status.failed or errors):
-        return
-    texts = [
-        f"trial {trial.number}: {trial.user_attrs.get(ERROR, 'no reason known')}"
-        for trial in sorted(status.failed, key=lambda trial: trial.number)
-    ] or [f"{worker}: {error.strip().splitlines()[-1]}" for worker, error in errors.items()]
-    count = len(status.failed)
-    what = f"every trial that was begun ({count})" if count else "every worker"
-    raise TuningFailed(
-        f"{what} of the study {name!r} failed, first {texts[0]}. The logs of the workers are in "
-        f"{folder}; the same command tries again"
-    )
+    @staticmethod
+    def enter(storage: BaseStorage, name: str, definition: Definition, trials: int) -> Search:
+        """Make a search, or join the one of that name, and fill it with waiting trials.
 
+        Trials that failed wait again.
 
-@contextmanager
-def _in_reach(storage: str | Path) -> Iterator[None]:
-    """Say in one line that a storage went away."""
-    try:
-        yield
-    except optuna.exceptions.StorageInternalError:
-        raise ConfigError(
-            f"the storage {shown_url(storage)} cannot be reached any more; what was done is kept "
-            "there, and the same command goes on when it is back"
-        ) from None  # whose text may hold the password
+        :param trials: how many the search shall have at least
+        :raises ConfigError: if the name belongs to another search
+        """
+        wanted = json.loads(json.dumps(definition.as_dict()))
+        with locked(storage, name) as alive:
+            study = optuna.create_study(
+                storage=storage, study_name=name, direction="maximize", load_if_exists=True
+            )
+            known = study.user_attrs
+            if DEFINITION in known or study.get_trials(deepcopy=False):
+                _compare(study, wanted)
+            else:
+                study.set_user_attr("method", definition.method)
+                study.set_user_attr(DEFINITION, wanted)
+            search = Search(study)
+            search._fill(max(trials, known.get(FILLED, 0)), alive)
+        return search
 
+    @staticmethod
+    def find(storage: BaseStorage, name: str, where: str) -> Search:
+        """Load a search that exists.
 
-def _checked(name: str) -> str:
-    if name.strip() in ("", ".", "..") or name.startswith("-"):
-        raise ConfigError(
-            f"a study cannot be named {name!r}, which is no name of a folder or looks like an "
-            "option; give it a name of letters and digits"
+        :param where: the storage, for the message
+        :raises ConfigError: if there is none of that name, or another program made it
+        """
+        names = [study.study_name for study in storage.get_all_studies()]
+        if name not in names:
+            raise ConfigError(
+                f"there is no search {name!r} in {where}; its searches are "
+                f"{', '.join(sorted(names)) or 'none'}"
+            )
+        study = optuna.load_study(storage=storage, study_name=name)
+        if DEFINITION not in study.user_attrs:
+            raise ConfigError(
+                f"the search {name!r} in {where} was not made by sb3-sparse tune; look at it with "
+                "optuna-dashboard"
+            )
+        return Search(study)
+
+    @property
+    def name(self) -> str:
+        """Its name in the storage."""
+        return self.study.study_name
+
+    @cached_property
+    def definition(self) -> Definition:
+        """What is tuned, and how."""
+        with quiet_optuna():
+            return Definition.from_dict(self.study.user_attrs[DEFINITION])
+
+    def status(self) -> SearchStatus:
+        """Return how far it is now."""
+        trials = self.study.get_trials(deepcopy=False)
+        by_ticket = {ticket_of(trial): trial for trial in trials}  # the last attempt counts
+        return SearchStatus(
+            all=tuple(trial for trial in trials if trial.state != TrialState.WAITING),
+            planned=self.study.user_attrs.get(FILLED, 0),
+            done=tuple(trial for trial in trials if trial.state in DONE),
+            running=tuple(trial for trial in trials if trial.state == TrialState.RUNNING),
+            failed=tuple(t for t in by_ticket.values() if t.state == TrialState.FAIL),
         )
-    return name
 
+    def best(self) -> FrozenTrial:
+        """Return the best trial so far.
 
-def define(
-    run: RunSpec,
-    space: str | Space,
-    seeds: int,
-    sampler: str | None,
-    pruner: str | None,
-    log_folder: Path,
-) -> Definition:
-    """The study that :func:`tune` makes, checked; nothing is written."""
-    if run.match_params is not None:
-        raise ConfigError(
-            "--match-params trains one dense network of a given size; tune --method dense, with "
-            "net_arch among the --hyperparams, instead"
+        :raises ConfigError: if no trial was completed
+        """
+        best = self.status().best
+        if best is None:
+            raise ConfigError(f"no trial of {self.name!r} was completed yet; let it continue")
+        return best
+
+    def best_settings(self) -> dict[str, Any]:
+        """Return the settings of the tuned run with the best values so far.
+
+        :raises ConfigError: if no trial was completed
+        """
+        return with_values(self.definition.run, self.best().user_attrs[VALUES]).settings()
+
+    def describe_best(self) -> str:
+        """Return where the best values come from: search, number of trials, score and date."""
+        status, best, seeds = self.status(), self.best(), self.definition.seeds
+        mean = f", mean of {seeds} seeds" if seeds > 1 else ""
+        finished = [t.datetime_complete for t in status.done if t.datetime_complete is not None]
+        return (
+            f"search {self.name}, trial {best.number} of {len(status.done)} trials, "
+            f"score {best.values[0]:.6g}{mean}, {max(finished).date()}"
         )
-    prepare(run, log_folder)
-    searched = space_of(space, run) if isinstance(space, str) else space
-    if sampler is None:
-        sampler = "grid" if searched.grid is not None else "tpe"
-    if pruner is None:
-        pruner = "none" if sampler == "grid" else "median"
-    run = replace(run, entry=run.config_entry())  # workers and reports need no file
-    return Definition(run, searched, seeds, sampler, pruner)
+
+    def _fill(self, trials: int, alive: Callable[[], None]) -> None:
+        known = self.study.get_trials(deepcopy=False)
+        present = {ticket_of(trial) for trial in known if trial.state in (*DONE, *ALIVE)}
+        for number in range(trials):
+            if number % 20 == 0:
+                alive()
+            if number not in present:
+                attributes = {TICKET: number, **self.definition.ticket(number)}
+                waiting = optuna.create_trial(state=TrialState.WAITING, system_attrs=attributes)
+                self.study.add_trial(waiting)
+        if self.study.user_attrs.get(FILLED) != trials:
+            self.study.set_user_attr(FILLED, trials)
 
 
-def _tasks(
-    storage: str | Path, name: str, folder: Path, workers: int, heartbeat: int
-) -> list[Task]:
-    if is_journal(storage):
-        storage = str(Path(storage).absolute())
-    folder = folder.absolute()
-    arguments: dict[str, Any] = {
-        "storage": storage,
-        "name": name,
-        "folder": str(folder / TRIALS),
-        "heartbeat": heartbeat,
-    }
-    return [
-        Task(f"worker {n}", WORK, arguments, folder / f"{node()}_{os.getpid()}_{n}.log")
-        for n in range(1, workers + 1)
-    ]
+def folder_name(name: str) -> str:
+    """Return the name of a search's folder; different searches have different folders."""
+    return re.sub(r"[%/\\]", lambda found: f"%{ord(found.group()):02X}", name)
+
+
+def ticket_of(trial: FrozenTrial) -> int | None:
+    """Return the number of the planned trial that this is an attempt at."""
+    number: int | None = trial.system_attrs.get(TICKET)
+    return number
+
+
+def _compare(study: optuna.Study, wanted: dict[str, Any]) -> None:
+    known = study.user_attrs.get(DEFINITION)
+    differ = ["it was not made by sb3-sparse"] if known is None else differences(wanted, known)
+    if differ:
+        raise ConfigError(
+            f"there is another search {study.study_name!r} in this storage: {'; '.join(differ)}. "
+            "Give this one a name of its own with --study-name"
+        )

@@ -1,4 +1,4 @@
-"""The paper's grid, and a wide continuous space around it."""
+"""The shipped spaces: the paper's grid, and a wide continuous space around it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ ACTOR_SHARE = (0.05, 0.6)
 
 
 def paper_space(method: str) -> Space:
-    """The paper's grid, of what the method has.
+    """Return the paper's grid over the hyperparameters that a method has.
 
     :param method: ``"dense"`` or a topology method
     :raises ConfigError: for an unknown method
@@ -38,17 +38,18 @@ def paper_space(method: str) -> Space:
         searched["update_interval"] = CategoricalDistribution(UPDATE_INTERVAL)
     if "drop_fraction" in topology.options:
         searched["drop_fraction"] = CategoricalDistribution(DROP_FRACTION)
-    if not topology.reaches_final:  # what starts dense has no sparse initialisation
+    if not topology.reaches_final:  # a dense start has no sparse initialisation
         searched["sparsity_aware_init"] = CategoricalDistribution(SPARSITY_AWARE_INIT)
     return Space("paper", searched)
 
 
 def wide_space(method: str, sizes: Mapping[str, int], sparsity: float | None) -> Space:
-    """A continuous space around the paper's grid, of what the method and the policy have.
+    """Return a continuous space around the paper's grid, for a method and a policy.
 
     :param method: ``"dense"`` or a topology method
-    :param sizes: connections of each dense network of the policy, by name
-    :param sparsity: of all of them; None: of each its own, so that nothing can be shared out
+    :param sizes: connections of each network of the policy, were it dense, by name
+    :param sparsity: of all networks together; None if each has its own, so that there is no common
+        budget to share out
     :raises ConfigError: for an unknown method
     """
     searched: dict[str, BaseDistribution] = {

@@ -1,8 +1,8 @@
-"""Search spaces by name or from a user's file."""
+"""Search spaces, by name or from a user's file."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,7 @@ from sb3_sparse.errors import ConfigError
 from sb3_sparse.loading.text import read_text
 from sb3_sparse.sparsity.numeric import is_number, is_whole
 from sb3_sparse.tuning.backend import BaseDistribution, quiet_optuna
-from sb3_sparse.tuning.choices import check_space
+from sb3_sparse.tuning.choices import check_space_name
 from sb3_sparse.tuning.shipped import paper_space, wide_space
 from sb3_sparse.tuning.spaces import (
     CategoricalDistribution,
@@ -28,22 +28,19 @@ from sb3_sparse.zoo.spec import RunSpec
 
 @quiet_optuna()
 def space_of(what: str, run: RunSpec) -> Space:
-    """A shipped space for a run, or the user's own from a file.
+    """Return a shipped space for a run, or a space of your own from a file.
 
-    A YAML file maps names to lists of choices or to ``{low: .., high: .., log: true, step: ..}``; a
-    Python file defines ``space``, such a mapping or a function of an Optuna trial that returns the
+    A YAML file maps names to lists of choices or to ``{low: .., high: .., log: true, step: ..}``. A
+    Python file defines ``space``: such a mapping, or a function of an Optuna trial that returns the
     values by name.
 
     :param what: ``"paper"``, ``"wide"`` or a path
     :param run: what is to be tuned
-    :raises ConfigError: if there is no such space, or something is wrong with it
+    :raises ConfigError: if there is no such space, or if it is not valid
     """
-    check_space(what)
-    method = method_of(run.settings())
-    if what == "paper":
-        return paper_space(method)
-    if what == "wide":
-        return _wide(run, method)
+    check_space_name(what)
+    if what in SHIPPED:
+        return SHIPPED[what](run)
     path = Path(what)
     if path.suffix in (".yml", ".yaml"):
         content = read_yaml(path, "hyperparameters to choices")
@@ -55,14 +52,22 @@ def space_of(what: str, run: RunSpec) -> Space:
     return Space(path.stem, code=code)
 
 
-def _wide(run: RunSpec, method: str) -> Space:
+def _paper(run: RunSpec) -> Space:
+    return paper_space(method_of(run.settings()))
+
+
+def _wide(run: RunSpec) -> Space:
     prepared = prepare(run, Path("logs"))
     policy = untrained_policy(
         run.algorithm, prepared.observation_space, prepared.action_space, prepared.settings
     )
     sizes = {network.name: network.size for network in policy.sparse.networks}
     sparsity = policy.sparsity_config.sparsity
-    return wide_space(method, sizes, sparsity if isinstance(sparsity, float) else None)
+    shared = sparsity if isinstance(sparsity, float) else None
+    return wide_space(method_of(run.settings()), sizes, shared)
+
+
+SHIPPED: dict[str, Callable[[RunSpec], Space]] = {"paper": _paper, "wide": _wide}
 
 
 def _distributions(content: Mapping[str, Any], name: str) -> dict[str, BaseDistribution]:

@@ -1,4 +1,4 @@
-"""What is searched: hyperparameters and where each may lie."""
+"""Search spaces: hyperparameters, and the values that each may take."""
 
 from __future__ import annotations
 
@@ -28,12 +28,25 @@ OF_METHODS = frozenset({"update_interval", "drop_fraction", "begin", "end", "upd
 class Space:
     """Hyperparameters to search, by the names that ``--hyperparams`` knows.
 
-    :param name: for the study's name and messages
-    :param distributions: Optuna's distribution of each; empty where ``code`` says how to sample
+    :param name: for the search's name and for messages
+    :param distributions: Optuna's distribution of each; empty if ``code`` samples
     :param code: Python source that defines ``space``, a function of an Optuna trial that returns
         the values by name
-    :raises ConfigError: for an empty space, bounds that are not finite, or choices that are not
-        numbers or that stand there twice
+    :raises ConfigError: for an empty space, for bounds that are not finite, and for choices that
+        are nan or occur twice
+
+    Example::
+
+        from optuna.distributions import CategoricalDistribution, FloatDistribution
+        from sb3_sparse.tuning import Space
+
+        space = Space(
+            "mine",
+            {
+                "weight_decay": FloatDistribution(1e-7, 1e-3, log=True),
+                "update_interval": CategoricalDistribution([100, 1000]),
+            },
+        )
     """
 
     name: str
@@ -50,9 +63,9 @@ class Space:
             _check_distribution(name, distribution, self.name)
 
     def sample(self, trial: Trial) -> dict[str, Any]:
-        """Values for a trial, by name.
+        """Sample values for a trial, by name.
 
-        :raises ConfigError: if the user's function fails or returns no mapping
+        :raises ConfigError: if the user's function fails, or does not return a mapping
         """
         if self.code is not None:
             return self._call(trial)
@@ -81,7 +94,7 @@ class Space:
 
     @property
     def grid(self) -> dict[str, list[Any]] | None:
-        """The choices of each hyperparameter, where all have choices; else None."""
+        """The choices of each hyperparameter; None if one has no choices."""
         if not self.distributions:
             return None
         choices = {}
@@ -92,14 +105,14 @@ class Space:
         return choices
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values that two equal spaces have in common."""
+        """Return plain values, which are equal for equal spaces."""
         to_json = optuna.distributions.distribution_to_json
         texts = {name: to_json(d) for name, d in sorted(self.distributions.items())}
         return {"name": self.name, "code": self.code, "distributions": texts}
 
     @staticmethod
     def from_dict(values: Mapping[str, Any]) -> Space:
-        """The space that :meth:`as_dict` described."""
+        """Make the space that :meth:`as_dict` described."""
         of = optuna.distributions.json_to_distribution
         return Space(
             values["name"],
@@ -114,7 +127,9 @@ def _check_distribution(name: str, distribution: BaseDistribution, space: str) -
         known: list[Any] = []
         for choice in distribution.choices:
             if isinstance(choice, float) and math.isnan(choice):
-                raise ConfigError(f"{where} has the choice nan, which is no number; leave it out")
+                raise ConfigError(
+                    f"{where} has the choice nan, which is not a number; leave it out"
+                )
             if any(type(one) is type(choice) and one == choice for one in known):
                 raise ConfigError(
                     f"{where} has the choice {choice!r} twice, so the same would be trained twice; "
@@ -142,10 +157,10 @@ def _suggest(trial: Trial, name: str, distribution: BaseDistribution) -> Any:
 
 
 def run_code(code: str, name: str) -> Any:
-    """What a Python source defines as ``space``.
+    """Return what a Python source defines as ``space``.
 
     :param name: of the file, for messages
-    :raises ConfigError: if it fails, or defines nothing of that kind
+    :raises ConfigError: if it fails, or does not define a mapping or a function
     """
     names: dict[str, Any] = {"__name__": "space"}
     try:
@@ -162,33 +177,33 @@ def run_code(code: str, name: str) -> Any:
 
 
 def with_values(run: RunSpec, values: Mapping[str, Any]) -> RunSpec:
-    """The run with sampled values for its hyperparameters."""
+    """Return the run with sampled values among its hyperparameters."""
     return replace(run, hyperparams={**run.hyperparams, **values})
 
 
 @quiet_optuna()
 def samples_of(space: Space) -> list[dict[str, Any]]:
-    """Samples of a space, always the same; of a function so many that its branches are seen."""
+    """Return samples of a space, always the same; of a function, enough to see its branches."""
     study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
     samples = []
     for _ in range(1 if space.code is None else BRANCHES):
-        with suppress(optuna.TrialPruned):  # a function may refuse what it has drawn
+        with suppress(optuna.TrialPruned):  # a function may reject its values
             samples.append(space.sample(study.ask()))
     return samples
 
 
 def one_of_each(space: Space) -> dict[str, Any]:
-    """A value of each name that the space may give."""
+    """Return one value of each name that the space may give."""
     return {name: value for values in samples_of(space) for name, value in values.items()}
 
 
 def check_space(space: Space, run: RunSpec) -> None:
-    """Refuse a space that the run has no place for, before anything is trained.
+    """Check that a run can take a space's values, before anything is trained.
 
-    Tries samples, and every choice and both ends of every range in one.
+    It tries samples, and in one of them every choice and both ends of every range.
 
-    :raises ConfigError: for a name that the algorithm, the policy or the method does not have, one
-        that the run itself has fixed, or a value that is not allowed
+    :raises ConfigError: for a name that algorithm, policy and method do not have, for one that the
+        run has fixed, and for a value that is not allowed
     """
     samples = samples_of(space)
     _check_names(space, run, {name for values in samples for name in values})

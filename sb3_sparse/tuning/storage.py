@@ -1,4 +1,4 @@
-"""Where studies are kept: a journal file, or whatever database Optuna has a URL for."""
+"""Where searches are kept: in a journal file or in a database."""
 
 from __future__ import annotations
 
@@ -23,13 +23,23 @@ JOURNAL = "journal.log"
 def open_storage(
     storage: str | Path, heartbeat: int = HEARTBEAT, stale: StaleCallback | None = None
 ) -> BaseStorage:
-    """The storage at a path or URL, made if it is new; workers take waiting trials only.
+    """Open the storage at a path or URL; a new one is made.
+
+    Whoever asks it for a trial gets one that waits in the search, never a new one.
 
     :param storage: path of a journal file, or a URL of SQLAlchemy's, e.g. ``sqlite:///studies.db``
         or ``postgresql://user:password@host/database``
-    :param heartbeat: seconds between two signs of life; after three without, a trial is given up
-    :param stale: called with such a trial, beside putting it into the queue again
-    :raises ConfigError: if it cannot be reached; names the URL without its password
+    :param heartbeat: seconds between two signs of life; a trial without any for three times as
+        long is given up, and waits again
+    :param stale: called with each such trial
+    :raises ConfigError: if it cannot be reached; shows the URL without its password
+
+    Example::
+
+        from sb3_sparse.tuning import open_storage
+
+        storage = open_storage("logs/tune/journal.log")
+        print([study.study_name for study in storage.get_all_studies()])
     """
     again = retry_with(stale)
     if not is_journal(storage):
@@ -40,14 +50,14 @@ def open_storage(
 
 
 def open_existing(storage: str | Path) -> BaseStorage:
-    """A storage to be looked at; nothing is written into it.
+    """Open a storage for reading; nothing is written into it.
 
     :raises ConfigError: if there is none, or it cannot be reached
     """
     path = file_of(storage)
     if path is not None and not path.is_file():
         raise ConfigError(
-            f"there are no studies in {path}; give the --log-folder or --storage that was tuned "
+            f"there are no searches in {path}; give the --log-folder or --storage that was tuned "
             "with"
         )
     if not is_journal(storage):
@@ -68,7 +78,7 @@ def _usable(journal: Path) -> Iterator[None]:
 
 
 def retry_with(stale: StaleCallback | None) -> StaleCallback:
-    """A callback that puts a trial into the queue again, and calls ``stale``."""
+    """Return a callback that makes a trial wait again, and then calls ``stale``."""
     with no_experimental_warnings():
         retry = RetryHeartbeatStaleTrialCallback()
 

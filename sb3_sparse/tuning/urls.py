@@ -1,4 +1,4 @@
-"""URLs of storages: understood, and printed without their passwords."""
+"""URLs of storages: parsed, and shown without their passwords."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ DATABASES = ("sqlite", "postgresql", "mysql", "mariadb", "mssql")
 
 
 def is_journal(storage: str | Path) -> bool:
-    """Whether a storage is a path, so a journal file.
+    """Return whether a storage is a path, i.e. a journal file.
 
-    :raises ConfigError: if it is neither a path nor a URL, but something in between, e.g. a URL
-        with one slash, whose password would become the name of a folder
+    :raises ConfigError: for something between a path and a URL, e.g. a URL with one slash, whose
+        password would become the name of a folder
     """
     text = str(storage)
     if not isinstance(storage, Path) and "://" in text:
@@ -26,15 +26,15 @@ def is_journal(storage: str | Path) -> bool:
     if (scheme or re.search(r":.*@", rest)) and not Path(text).exists():
         name = scheme.group(1) if scheme and scheme.group(1).split("+")[0] in DATABASES else ""
         raise ConfigError(
-            f"the storage {f'{name}:...' if name else 'of this form'} looks like a URL, and is "
-            "none; give a path (a journal file) or a URL as text, with its two or three slashes: "
-            "sqlite:///file.db, postgresql://user:password@host:5432/database, mysql://..."
+            f"the storage {f'{name}:...' if name else 'of this form'} looks like a URL, but "
+            "is not one; give a path (a journal file) or a URL as text, with its two or three "
+            "slashes: sqlite:///file.db, postgresql://user:password@host:5432/database, mysql://..."
         )
     return True
 
 
 def file_of(storage: str | Path) -> Path | None:
-    """The file of a journal or an SQLite database; None for a server."""
+    """Return the file of a journal or an SQLite database; None for a server."""
     if is_journal(storage):
         return Path(storage)
     url = url_of(str(storage))
@@ -42,9 +42,9 @@ def file_of(storage: str | Path) -> Path | None:
 
 
 def shown_url(storage: str | Path) -> str:
-    """A storage as it may be printed.
+    """Return a storage as text without its password.
 
-    :raises ConfigError: if it is none
+    :raises ConfigError: if it is not a storage
     """
     if is_journal(storage):
         return str(storage)
@@ -56,9 +56,9 @@ def shown_url(storage: str | Path) -> str:
 
 
 def url_of(storage: str) -> Any:
-    """A URL as SQLAlchemy has it, for the driver that the extra ``postgres`` brings.
+    """Parse a URL of SQLAlchemy's; PostgreSQL gets the driver of the extra ``postgres``.
 
-    :raises ConfigError: for another kind of storage, or a URL that is none; shows its scheme alone
+    :raises ConfigError: for another kind of storage, or a malformed URL; shows its scheme only
     """
     from sqlalchemy.engine import make_url
     from sqlalchemy.exc import ArgumentError
@@ -74,18 +74,18 @@ def url_of(storage: str) -> Any:
         url = make_url(storage)
         known = url.get_backend_name() in DATABASES
         known = known and "@" not in (url.host or "")
-    except (ArgumentError, ValueError):  # whose texts may hold the password
+    except (ArgumentError, ValueError):  # their texts may hold the password
         known = False
     if not known:
         raise ConfigError(
-            f"a storage {shown} is not known, or the rest of its URL is not understood; allowed "
+            f"the storage {shown} is unknown, or the rest of its URL is malformed; allowed "
             "are a path (a journal file) and URLs of SQLAlchemy: sqlite:///file.db, "
             "postgresql://user:password@host:5432/database, mysql://..."
         ) from None
     if url.get_backend_name() == "sqlite" and not url.database:
         raise ConfigError(
-            "a storage sqlite:// lives in one process alone, and workers are processes; name a "
-            "file, e.g. sqlite:///studies.db"
+            "the storage sqlite:// lives in a single process, but workers are processes of their "
+            "own; name a file, e.g. sqlite:///studies.db"
         )
     if url.drivername == "postgresql":
         url = url.set(drivername="postgresql+psycopg")

@@ -1,4 +1,4 @@
-"""What one worker does: take trials from a study until there are none."""
+"""A worker: it takes trials from a search until none is left."""
 
 from __future__ import annotations
 
@@ -11,32 +11,32 @@ from platform import node
 from sb3_sparse.tuning.backend import FrozenTrial, Trial, TrialState, optuna, quiet_optuna
 from sb3_sparse.tuning.objective import Objective
 from sb3_sparse.tuning.queue import QueueEmpty
+from sb3_sparse.tuning.search import ERROR, Search
 from sb3_sparse.tuning.storage import HEARTBEAT, open_storage, retry_with
-from sb3_sparse.tuning.study import ERROR, definition_of, find_study, status_of
 from sb3_sparse.tuning.urls import shown_url
 
 FAILURES = 3
-MOMENT = 1.0
+PAUSE = 1.0  # seconds between two looks for a trial
 
 
 class TooManyFailures(Exception):
-    """Trials fail one after the other."""
+    """Several trials in a row have failed."""
 
 
 @quiet_optuna()
 def work(
     storage: str | Path, name: str, folder: str | Path, heartbeat: int = HEARTBEAT
 ) -> dict[str, int]:
-    """Take and train trials until all of the study are done, also those that others lose.
+    """Take and train trials until all of a search are done, including those that others lose.
 
     :param storage: path or URL
-    :param name: of the study
+    :param name: of the search
     :param folder: where the trials' folders go
     :param heartbeat: seconds between two signs of life
     :return: how many trials were ``"trained"`` and how many ``"failed"``
-    :raises ConfigError: if this machine does not see the study
-    :raises TooManyFailures: after three failures in a row, with the last one's text
-    :raises KeyboardInterrupt: when stopped; the trial at hand waits again
+    :raises ConfigError: if this machine does not see the search
+    :raises TooManyFailures: after three failures in a row, with the text of the last
+    :raises KeyboardInterrupt: when stopped; the current trial waits again
     """
     trials = Path(folder)
 
@@ -44,8 +44,8 @@ def work(
         shutil.rmtree(trials / str(trial.number), ignore_errors=True)
 
     opened = open_storage(storage, heartbeat, forget)
-    study = find_study(opened, name, f"{shown_url(storage)} of {node()}")
-    definition = definition_of(study)
+    search = Search.find(opened, name, f"{shown_url(storage)} of {node()}")
+    study, definition = search.study, search.definition
     study.sampler, study.pruner = definition.make_sampler(), definition.make_pruner()
     objective = Objective(definition.run, definition.space, definition.seeds, trials)
     again = retry_with(forget)
@@ -56,9 +56,9 @@ def work(
             study.optimize(attempt, n_trials=1)
             counts["trained"], in_a_row = counts["trained"] + 1, 0
         except QueueEmpty:
-            if not status_of(study).running:
+            if not search.status().running:
                 return counts
-            time.sleep(MOMENT)  # until the others are done, or are found to be lost
+            time.sleep(PAUSE)  # until the others end, or are found lost
         except KeyboardInterrupt:
             if attempt.number is not None:
                 trial = study.get_trials(deepcopy=False)[attempt.number]
@@ -71,14 +71,14 @@ def work(
             counts["failed"], in_a_row = counts["failed"] + 1, in_a_row + 1
             if in_a_row == FAILURES:
                 raise TooManyFailures(
-                    f"{FAILURES} trials in a row have failed, the last one so: {error}"
+                    f"{FAILURES} trials in a row have failed, the last one with: {error}"
                 ) from error
 
 
 class _Attempt:
-    """The objective, noting whose trial it was and what went wrong.
+    """The objective of one trial, which records the trial's number and its error.
 
-    :param objective: the study's
+    :param objective: of the search
     """
 
     def __init__(self, objective: Objective) -> None:

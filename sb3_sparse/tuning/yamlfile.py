@@ -1,4 +1,4 @@
-"""Writing settings as YAML that PyYAML reads, and changing one entry of a file."""
+"""Settings as YAML: written as PyYAML reads it, or merged into one entry of a file."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ INDENT = 2
 
 
 class _Dumper(yaml.SafeDumper):  # type: ignore[misc]
-    """Indents lists below their key; writes those of plain values in one line."""
+    """A dumper that indents lists below their key, and writes lists of plain values in one line."""
 
     def increase_indent(self, flow: bool = False, indentless: bool = False) -> Any:
         return super().increase_indent(flow, False)
@@ -36,7 +36,7 @@ _Dumper.add_representer(tuple, _Dumper.represent_items)
 
 
 def as_yaml(content: Mapping[str, Any]) -> str:
-    """A mapping of plain values as block YAML, as rl-zoo (PyYAML) reads it."""
+    """Write a mapping of plain values as block YAML, as rl-zoo (PyYAML) reads it."""
     text = yaml.dump(dict(content), Dumper=_Dumper, sort_keys=False, width=4096, allow_unicode=True)
     assert isinstance(text, str)
     return text
@@ -45,12 +45,13 @@ def as_yaml(content: Mapping[str, Any]) -> str:
 def merge_entry(
     text: str, key: str, settings: Mapping[str, Any], comment: str, mark: str, name: str
 ) -> str:
-    """A YAML text in which one top-level entry has the settings, and all else is as it was.
+    """Give one top-level entry of a YAML text new settings, and leave everything else as it is.
 
-    :param key: of the entry; where there is none, one is added at the end, on top of ``default``
-    :param comment: a line to be put into the entry, in place of one that begins with ``mark``
+    :param key: of the entry; a missing one is added at the end, based on ``default``
+    :param comment: a line for the entry, which replaces a line that begins with ``mark``
     :param name: of the file, for messages
-    :raises ConfigError: if other entries would change with this one, or the text is not understood
+    :return: the new text
+    :raises ConfigError: if other entries would change too, or if the text cannot be parsed
     """
     ending = "\r\n" if "\r\n" in text else "\n"
     lines = text.splitlines()
@@ -62,7 +63,7 @@ def merge_entry(
             entry = document[key]
             shared = any(document[other] is entry for other in document if other != key)
             if shared or not isinstance(entry, CommentedMap) or entry.fa.flow_style():
-                raise ConfigError(f"{by_hand}, since it is no block of its own; {cure}")
+                raise ConfigError(f"{by_hand}, since it is not a block of its own; {cure}")
             _Entry(lines, document, key).change(settings, comment, mark)
         else:
             lines += ["", *_new_entry(document, key, settings, comment)]
@@ -96,10 +97,10 @@ def _new_entry(
 
 
 class _Entry:
-    """One entry's lines, changed in place.
+    """One entry of a YAML text, whose lines are changed in place.
 
-    :param lines: of the whole text
-    :param document: as ruamel.yaml has read it
+    :param lines: the whole text
+    :param document: the text as ruamel.yaml read it
     :param key: of the entry
     """
 
@@ -107,7 +108,7 @@ class _Entry:
         self.lines, self.document, self.key = lines, document, key
 
     def change(self, settings: Mapping[str, Any], comment: str, mark: str) -> None:
-        """Make the entry say what the settings say."""
+        """Give the entry the settings and the comment."""
         start = self.document.lc.key(self.key)[0]
         end = self._end(start)
         edits = self._edits(self.document[self.key], settings, end)
@@ -120,7 +121,7 @@ class _Entry:
     def _edits(
         self, known: CommentedMap, wanted: Mapping[str, Any], end: int
     ) -> list[tuple[int, int, list[str]]]:
-        """Lines to replace in a block mapping: first, last + 1, the new ones."""
+        """Return the lines to replace in a block mapping: first, last + 1 and the new ones."""
         own = [name for name in known if name in (known.lc.data or {})]
         column = min((known.lc.key(name)[1] for name in own), default=INDENT)
         edits, added = [], []
@@ -146,7 +147,7 @@ class _Entry:
         return edits
 
     def _end(self, first: int) -> int:
-        """The line after the last one of the key that stands on a line."""
+        """Return the line after the block of the key at a line."""
         column = _indent(self.lines[first])
         last = first
         for number in range(first + 1, len(self.lines)):

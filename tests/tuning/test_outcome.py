@@ -19,11 +19,12 @@ from sb3_sparse.cli.progress.tune import TuningProgress
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.tuning import tune, write_report
 from sb3_sparse.tuning.backend import TrialState, optuna
-from sb3_sparse.tuning.best import best_settings, check_target, write_best, write_into
-from sb3_sparse.tuning.report import report_on
-from sb3_sparse.tuning.search import define
+from sb3_sparse.tuning.best import check_target, merge_best, write_best
+from sb3_sparse.tuning.report import report_by_name
+from sb3_sparse.tuning.samplers import TICKET
+from sb3_sparse.tuning.search import DEFINITION, Search
 from sb3_sparse.tuning.storage import open_storage
-from sb3_sparse.tuning.study import DEFINITION, TICKET, enter_study, status_of
+from sb3_sparse.tuning.tuner import define
 from sb3_sparse.zoo.configs import config_path
 from sb3_sparse.zoo.spec import RunSpec
 from sb3_sparse.zoo.training import train
@@ -36,7 +37,7 @@ def finished(storage, name, value, run=None, space=SPACE, seeds=1):
     """A study whose trials were not trained: each has the value that a function gives it."""
     run = run or small_run()
     definition = define(run, space, seeds, None, None, LOGS)
-    study = enter_study(storage, name, definition, definition.trials(None))
+    study = Search.enter(storage, name, definition, definition.trials(None)).study
     study.sampler = definition.make_sampler()
 
     def objective(trial):
@@ -67,16 +68,17 @@ def study(storage):
 
 
 def test_the_best_values_are_a_config_that_trains_as_it_is(study, tmp_path):
-    path = write_best(study, tmp_path / "best.yml")
+    path = write_best(Search(study), tmp_path / "best.yml")
     first = path.read_text().splitlines()[0]
     assert re.fullmatch(
-        r"# Tuned by sb3-sparse: study mine, trial \d of 6 trials, score 99, \d{4}-\d\d-\d\d", first
+        r"# Tuned by sb3-sparse: search mine, trial \d of 6 trials, score 99, \d{4}-\d\d-\d\d",
+        first,
     )
     datetime.strptime(first.rpartition(" ")[2], "%Y-%m-%d")
     content = yaml.safe_load(path.read_text())
     assert content.keys() == {"CartPole-v1"}
     entry = content["CartPole-v1"]
-    assert entry == best_settings(study)
+    assert entry == Search(study).best_settings()
     assert entry["policy_kwargs"]["weight_decay"] == 1e-6
     assert "compute" not in entry["policy_kwargs"]  # a choice of tuning's
     assert entry["callback"][0]["sb3_sparse.SparsityCallback"]["update_interval"] == 100
@@ -93,13 +95,13 @@ def test_the_best_values_go_into_one_entry_of_a_config(storage, tmp_path):
     path = tmp_path / "dqn.yml"
     text = config_path("rigl", "dqn").read_text()
     path.write_text(text)
-    write_into(study, path)
+    merge_best(Search(study), path)
     before, after = yaml.safe_load(text), yaml.safe_load(path.read_text())
-    assert after["Acrobot-v1"] == best_settings(study)
+    assert after["Acrobot-v1"] == Search(study).best_settings()
     assert {**after, "Acrobot-v1": None} == {**before, "Acrobot-v1": None}
     lines = iter(path.read_text().splitlines())
     assert all(line in lines for line in text.splitlines())  # all are there, in their order
-    assert "Acrobot-v1:\n  # Tuned by sb3-sparse: study acrobot, " in path.read_text()
+    assert "Acrobot-v1:\n  # Tuned by sb3-sparse: search acrobot, " in path.read_text()
 
 
 def config_of_ones_own(tmp_path) -> Path:
@@ -112,11 +114,11 @@ def test_a_study_whose_config_has_taken_the_best_values_is_still_the_same(storag
     path = config_of_ones_own(tmp_path)
     run = small_run(env_id="Acrobot-v1", conf_file=str(path))
     study = finished(storage, "mine", decay_matters, run)
-    best = best_settings(study)
-    write_into(study, path)
+    best = Search(study).best_settings()
+    merge_best(Search(study), path)
     again = finished(storage, "mine", decay_matters, run)
     assert len(again.get_trials()) == 6
-    assert best_settings(again) == best
+    assert Search(again).best_settings() == best
     path.write_text(path.read_text().replace("gamma: 0.99", "gamma: 0.9"))
     with pytest.raises(ConfigError, match="settings.gamma is 0.99 there and 0.9 now"):
         finished(storage, "mine", decay_matters, run)
@@ -126,8 +128,8 @@ def test_a_study_needs_its_config_no_more(storage, study, tmp_path):
     path = config_of_ones_own(tmp_path)
     other = finished(storage, "other", decay_matters, small_run(conf_file=str(path)))
     path.unlink()
-    assert "<h2>mine</h2>" in report_on(["mine"], None, tmp_path, None).read_text()
-    assert best_settings(other)["gamma"] == 0.99
+    assert "<h2>mine</h2>" in report_by_name(["mine"], None, tmp_path, None).read_text()
+    assert Search(other).best_settings()["gamma"] == 0.99
 
 
 def test_a_study_that_cannot_be_read_here_is_named_and_spoils_no_page(storage, study, tmp_path):
@@ -143,7 +145,8 @@ def test_a_link_stays_a_link_and_modes_stay(storage, tmp_path):
     path.chmod(0o664)
     link = tmp_path / "link.yml"
     link.symlink_to(path)
-    write_into(finished(storage, "a", decay_matters, small_run(env_id="Acrobot-v1")), link)
+    study = finished(storage, "a", decay_matters, small_run(env_id="Acrobot-v1"))
+    merge_best(Search(study), link)
     assert link.is_symlink()
     assert "Tuned by" in path.read_text()
     assert path.stat().st_mode & 0o777 == 0o664
@@ -163,7 +166,7 @@ def test_what_cannot_take_the_values_is_refused_before_the_search(tmp_path):
         "CartPole-v1: {n_timesteps: 9, policy: sb3_sparse.SparsePolicy, policy_kwargs: "
         "{sparsity: 0.9}, callback: [{sb3_sparse.SparsityCallback: {method: rigl}}]}\n"
     )
-    with pytest.raises(ConfigError, match="it is no block of its own; take the tuned settings"):
+    with pytest.raises(ConfigError, match="it is not a block of its own; take the tuned settings"):
         check_target(small_run(), path)
 
 
@@ -171,7 +174,7 @@ def test_a_config_of_another_method_is_left_alone(study, tmp_path):
     path = tmp_path / "dqn.yml"
     path.write_text(config_path("set", "dqn").read_text())
     with pytest.raises(ConfigError, match="by method 'set', but 'rigl' is tuned"):
-        write_into(study, path)
+        merge_best(Search(study), path)
     assert path.read_text() == config_path("set", "dqn").read_text()
 
 
@@ -209,25 +212,28 @@ def test_what_optuna_says_of_a_figure_stands_below_it(storage, tmp_path):
 @pytest.mark.parametrize(
     ("names", "message"),
     [
-        (["nope"], "there is no study 'nope' in .*journal.log; its studies are foreign, mine, new"),
+        (
+            ["nope"],
+            "there is no search 'nope' in .*journal.log; its searches are foreign, mine",
+        ),
         (["foreign"], "'foreign' in .* was not made by sb3-sparse tune; look at it with optuna-d"),
         (["new"], "no trial of 'new' was completed yet, so there is nothing to report"),
     ],
 )
 def test_studies_that_cannot_be_reported(study, storage, tmp_path, names, message):
     optuna.create_study(storage=storage, study_name="foreign")
-    enter_study(storage, "new", define(small_run(), SPACE, 1, None, None, LOGS), 6)
+    Search.enter(storage, "new", define(small_run(), SPACE, 1, None, None, LOGS), 6)
     with pytest.raises(ConfigError, match=message):
-        report_on(names, None, tmp_path, None)
+        report_by_name(names, None, tmp_path, None)
 
 
 def test_a_journal_that_is_not_there(tmp_path):
-    with pytest.raises(ConfigError, match="there are no studies in .*journal.log; give the"):
-        report_on(["x"], None, tmp_path, None)
+    with pytest.raises(ConfigError, match="there are no searches in .*journal.log; give the"):
+        report_by_name(["x"], None, tmp_path, None)
 
 
 def test_no_best_without_a_trial(storage, tmp_path):
-    new = enter_study(storage, "new", define(small_run(), SPACE, 1, None, None, LOGS), 6)
+    new = Search.enter(storage, "new", define(small_run(), SPACE, 1, None, None, LOGS), 6)
     with pytest.raises(ConfigError, match="no trial of 'new' was completed yet"):
         write_best(new, tmp_path / "best.yml")
     assert not (tmp_path / "best.yml").exists()
@@ -236,15 +242,16 @@ def test_no_best_without_a_trial(storage, tmp_path):
 def test_progress_is_a_line_a_trial_with_the_best_so_far(storage):
     text = io.StringIO()
     progress = TuningProgress(Console(file=text, width=200))
-    study = enter_study(storage, "new", define(small_run(), SPACE, 1, None, None, LOGS), 6)
-    progress(status_of(study))
+    search = Search.enter(storage, "new", define(small_run(), SPACE, 1, None, None, LOGS), 6)
+    study = search.study
+    progress(search.status())
     for value in (3.0, 1.0):
         study.optimize(lambda trial, value=value: value, n_trials=1)
-        progress(status_of(study))
+        progress(search.status())
     with pytest.raises(ZeroDivisionError):
         study.optimize(lambda trial: 1 / 0, n_trials=1)
-    progress(status_of(study))
-    progress(status_of(study))
+    progress(search.status())
+    progress(search.status())
     progress.close()
     assert [line.rstrip(" ;") for line in text.getvalue().splitlines()] == [
         "1 of 6: trial 0 score 3, best so far 3 (trial 0)",
@@ -254,15 +261,16 @@ def test_progress_is_a_line_a_trial_with_the_best_so_far(storage):
 
 
 def test_the_last_attempt_at_a_planned_trial_counts(storage):
-    study = enter_study(storage, "new", define(small_run(), SPACE, 1, None, None, LOGS), 1)
+    search = Search.enter(storage, "new", define(small_run(), SPACE, 1, None, None, LOGS), 1)
+    study = search.study
     with pytest.raises(ZeroDivisionError):
         study.optimize(lambda trial: 1 / 0, n_trials=1)
-    assert len(status_of(study).failed) == 1
+    assert len(search.status().failed) == 1
     waiting = optuna.create_trial(state=TrialState.WAITING, system_attrs={TICKET: 0})
     study.add_trial(waiting)
-    assert not status_of(study).failed
+    assert not search.status().failed
     study.optimize(lambda trial: 5.0, n_trials=1)
-    status = status_of(study)
+    status = search.status()
     assert status.finished
     assert status.best.number == 1
 

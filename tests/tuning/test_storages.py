@@ -17,8 +17,9 @@ from tuning_support import choices, small_run
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.tuning import tune
 from sb3_sparse.tuning.backend import TrialState, optuna
+from sb3_sparse.tuning.internals import id_of
 from sb3_sparse.tuning.queue import QueueEmpty
-from sb3_sparse.tuning.report import report_on
+from sb3_sparse.tuning.report import report_by_name
 from sb3_sparse.tuning.samplers import TICKET
 from sb3_sparse.tuning.storage import open_existing, open_storage
 
@@ -87,7 +88,7 @@ def test_two_processes_that_find_the_same_trial_lost_put_it_into_the_queue_once(
     def give_up(barrier):
         study = opened(storage, "lost")
         for trial in study.get_trials():
-            stale = [trial._trial_id]
+            stale = [id_of(trial)]
             study._storage._get_stale_trial_ids = lambda study_id, stale=stale: stale
             barrier.wait()
             optuna.storages.fail_stale_trials(study)
@@ -199,7 +200,7 @@ def test_a_journal_that_is_damaged_in_its_middle_is_refused_with_the_line(tmp_pa
     lines = path.read_bytes().splitlines(keepends=True)
     damaged = b"".join([lines[0], b"torn\n", *lines[1:]])
     path.write_bytes(damaged)
-    with pytest.raises(ConfigError, match="its line 2 is no record of Optuna"):
+    with pytest.raises(ConfigError, match="its line 2 is not a record of Optuna"):
         open_storage(path)
     assert path.read_bytes() == damaged
 
@@ -224,7 +225,7 @@ def test_looking_at_a_study_writes_nothing_but_the_report(tmp_path):
     (journal.parent / "journal.log.alive").rmdir()
     before = everything_in(tmp_path / "kept")
     for storage in (None, url):
-        report_on(["study"], storage, tmp_path / "kept", tmp_path / "report.html")
+        report_by_name(["study"], storage, tmp_path / "kept", tmp_path / "report.html")
     assert everything_in(tmp_path / "kept") == before
     assert sorted(path.name for path in tmp_path.iterdir()) == ["kept", "report.csv", "report.html"]
 
@@ -233,6 +234,6 @@ def test_looking_at_a_database_without_studies_makes_no_tables(tmp_path):
     with sqlite3.connect(tmp_path / "other.db") as database:
         database.execute("create table mine (x)")
     before = (tmp_path / "other.db").read_bytes()
-    with pytest.raises(ConfigError, match="there are no studies in sqlite:///"):
+    with pytest.raises(ConfigError, match="there are no searches in sqlite:///"):
         open_existing(f"sqlite:///{tmp_path}/other.db")
     assert (tmp_path / "other.db").read_bytes() == before

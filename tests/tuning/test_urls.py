@@ -9,7 +9,7 @@ from tuning_support import choices, small_run
 
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.tuning import tune
-from sb3_sparse.tuning.report import report_on
+from sb3_sparse.tuning.report import report_by_name
 from sb3_sparse.tuning.storage import open_storage
 from sb3_sparse.tuning.urls import is_journal
 
@@ -37,9 +37,9 @@ def test_what_looks_like_a_url_and_is_none_is_refused_and_makes_nothing(
     for use in (
         lambda: tune(small_run(), choices(weight_decay=[0.0]), storage=storage),
         lambda: open_storage(storage),
-        lambda: report_on(["study"], storage, tmp_path, None),
+        lambda: report_by_name(["study"], storage, tmp_path, None),
     ):
-        with pytest.raises(ConfigError, match="looks like a URL, and is none; give a path") as said:
+        with pytest.raises(ConfigError, match="looks like a URL, but is not one; give a") as said:
             use()
         assert "s3cret" not in str(said.value)
     assert list(tmp_path.iterdir()) == []

@@ -21,9 +21,9 @@ from sb3_sparse.tuning import Space, tune
 from sb3_sparse.tuning.backend import TrialState, optuna
 from sb3_sparse.tuning.queue import QueueEmpty
 from sb3_sparse.tuning.samplers import TICKET, sampler_of
-from sb3_sparse.tuning.search import define
+from sb3_sparse.tuning.search import Search, ticket_of
 from sb3_sparse.tuning.storage import open_storage, retry_with
-from sb3_sparse.tuning.study import enter_study, status_of, ticket_of
+from sb3_sparse.tuning.tuner import define
 from sb3_sparse.tuning.worker import TooManyFailures, work
 
 GRID = dict(weight_decay=[0.0, 1e-4], update_interval=[100, 200, 400])
@@ -155,16 +155,16 @@ def test_an_interrupted_study_goes_on_with_the_same_command(tmp_path):
     running.send_signal(signal.SIGINT)
     said, _ = running.communicate(timeout=60)
     assert running.returncode == 130
-    assert "Interrupted. What was done is kept; the same command goes on." in said
+    assert "Interrupted. Finished trials are kept; the same command continues." in said
     found = states(study)
     assert found["FAIL"] == 1
     assert found["RUNNING"] == 0
     assert found["WAITING"] == 2 - found["COMPLETE"]
 
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
-    assert f"Study {name}: 2 of 2 trials are done." in done.stdout
+    assert f"Search {name}: 2 of 2 trials are done." in done.stdout
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
-    assert f"The study {name} is finished: 2 of 2 trials are done. Nothing to do." in done.stdout
+    assert f"The search {name} is finished: 2 of 2 trials are done. Nothing to do." in done.stdout
     assert states(study)["COMPLETE"] == 2
 
 
@@ -174,7 +174,7 @@ def test_trials_that_fail_are_noted_and_tried_again_by_the_next_command(tmp_path
     journal = tmp_path / "tune" / "journal.log"
     assert work(journal, "study", tmp_path / "trials") == {"trained": 1, "failed": 2}
     study = optuna.load_study(storage=open_storage(journal), study_name="study")
-    status = status_of(study)
+    status = Search(study).status()
     assert [len(status.done), len(status.failed)] == [1, 2]
     assert not status.finished
     assert all("No module named 'no'" in trial.user_attrs["error"] for trial in status.failed)
@@ -226,18 +226,18 @@ def test_studies_of_different_names_never_share_a_folder(names, tmp_path):
 
 
 def test_a_worker_that_does_not_see_the_study_says_so(tmp_path):
-    with pytest.raises(ConfigError, match="there is no study 'study' in .*elsewhere.log of "):
+    with pytest.raises(ConfigError, match="there is no search 'study' in .*elsewhere.log of "):
         work(tmp_path / "elsewhere.log", "study", tmp_path / "trials")
 
 
 def test_three_failures_in_a_row_end_a_worker(tmp_path):
     made(tmp_path, choices(env_wrapper=[f"no.such.Wrapper{n}" for n in range(4)]))
-    with pytest.raises(TooManyFailures, match="3 trials in a row have failed, the last one so: "):
+    with pytest.raises(TooManyFailures, match="3 trials in a row have failed, the last one with: "):
         work(tmp_path / "tune" / "journal.log", "study", tmp_path / "trials")
 
 
 def test_a_study_that_was_not_filled_to_its_end_is_filled(tmp_path, monkeypatch):
-    monkeypatch.setattr("sb3_sparse.tuning.study.PATIENCE", 0.5)
+    monkeypatch.setattr("sb3_sparse.tuning.lock.PATIENCE", 0.5)
     study = made(tmp_path).study
     journal = tmp_path / "tune" / "journal.log"
     lines = journal.read_text().splitlines()
@@ -245,7 +245,7 @@ def test_a_study_that_was_not_filled_to_its_end_is_filled(tmp_path, monkeypatch)
     storage = open_storage(journal)
     assert states(optuna.load_study(storage=storage, study_name="study"))["WAITING"] < 6
     definition = define(small_run(), choices(**GRID), 1, None, None, tmp_path)
-    study = enter_study(storage, "study", definition, 6)
+    study = Search.enter(storage, "study", definition, 6).study
     assert states(study) == {"WAITING": 6}
     grid_ids = {trial.system_attrs["grid_id"] for trial in study.get_trials()}
     assert grid_ids == set(range(6))
@@ -267,12 +267,12 @@ def test_more_trials_can_be_asked_for_later(tmp_path):
 )
 def test_another_study_of_the_same_name_is_refused(tmp_path, change, message):
     made(tmp_path)
-    with pytest.raises(ConfigError, match=f"another study 'study'.*{message}.*--study-name"):
+    with pytest.raises(ConfigError, match=f"another search 'study'.*{message}.*--study-name"):
         made(tmp_path, **change)
 
 
 def test_a_study_of_somebody_else_is_left_alone(tmp_path, monkeypatch):
-    monkeypatch.setattr("sb3_sparse.tuning.study.PATIENCE", 0.1)
+    monkeypatch.setattr("sb3_sparse.tuning.lock.PATIENCE", 0.1)
     (tmp_path / "tune").mkdir()
     url = f"sqlite:///{tmp_path}/studies.db"
     study = optuna.create_study(storage=url, study_name="study")
@@ -291,8 +291,8 @@ def unreachable():
     [
         (unreachable(), r"postgresql\+psycopg://tuner:\*\*\*@127.0.0.1:9/studies cannot be"),
         (f"{unreachable()}?password=s3cret", "password=hidden cannot be reached"),
-        ("redis://:s3cret@localhost", "a storage redis://... is not known, .*; allowed are"),
-        ("postgres:/s3cret://x", "a storage of this form is not known"),
+        ("redis://:s3cret@localhost", "the storage redis://... is unknown, .*; allowed are"),
+        ("postgres:/s3cret://x", "the storage of this form is unknown"),
     ],
 )
 def test_a_storage_that_cannot_be_reached_is_named_without_its_password(tmp_path, storage, message):
@@ -310,8 +310,11 @@ def test_a_storage_that_cannot_be_reached_is_named_without_its_password(tmp_path
             "more than one @; write an @ in a password as",
         ),
         ("postgresql://u:s3?cr@t3@127.0.0.1:9/x", "more than one @; write an @ in a password as"),
-        ("sqlite://", "lives in one process alone, and workers are processes; name a file"),
-        ("postgresql://u:p:s3cret@127.0.0.1:t3/x", "is not known, or the rest of its URL is not"),
+        ("sqlite://", "lives in a single process, but workers are .*; name a file"),
+        (
+            "postgresql://u:p:s3cret@127.0.0.1:t3/x",
+            "is unknown, or the rest of its URL is",
+        ),
     ],
 )
 def test_an_odd_password_is_not_shown_either(url, message):
@@ -332,7 +335,7 @@ def test_commands_that_start_or_extend_a_study_at_once_plan_each_trial_once(
 
     def enter(trials):
         try:
-            enter_study(open_storage(storage), "at once", definition, trials)
+            Search.enter(open_storage(storage), "at once", definition, trials)
         except Exception as error:
             failures.append(error)
 
@@ -385,12 +388,11 @@ def test_what_was_interrupted_comes_first_and_changes_nothing(tmp_path):
 def test_a_storage_that_goes_away_is_one_line(tmp_path, monkeypatch):
     made(tmp_path)
 
-    def gone(study):
+    def gone(search):
         raise optuna.exceptions.StorageInternalError("me:s3cret@host")
 
-    looks = iter([status_of])
-    module = sys.modules[tune.__module__]
-    monkeypatch.setattr(module, "status_of", lambda study: next(looks, gone)(study))
+    looks = iter([Search.status])
+    monkeypatch.setattr(Search, "status", lambda search: next(looks, gone)(search))
     with pytest.raises(ConfigError, match="journal.log cannot be reached any more") as caught:
         made(tmp_path, watch=lambda status: None)
     assert "s3cret" not in str(caught.value)
@@ -398,7 +400,7 @@ def test_a_storage_that_goes_away_is_one_line(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("name", ["", ".", "..", "-x"])
 def test_names_that_are_no_folders_are_refused(tmp_path, name):
-    with pytest.raises(ConfigError, match="a study cannot be named"):
+    with pytest.raises(ConfigError, match="a search cannot be named"):
         tune(small_run(), choices(**GRID), log_folder=tmp_path, name=name, launcher=NoWorkers())
     assert not list(tmp_path.iterdir())
 
@@ -406,11 +408,11 @@ def test_names_that_are_no_folders_are_refused(tmp_path, name):
 def test_a_lock_of_a_dead_process_is_taken_over_and_that_of_a_live_one_is_not(
     tmp_path, monkeypatch
 ):
-    monkeypatch.setattr("sb3_sparse.tuning.study.PATIENCE", 1.0)
+    monkeypatch.setattr("sb3_sparse.tuning.lock.PATIENCE", 1.0)
     storage = open_storage(tmp_path / "j.log")
     lock = optuna.create_study(storage=storage, study_name="study is being filled")
     definition = define(small_run(), choices(**GRID), 1, None, None, tmp_path)
-    entered = threading.Thread(target=enter_study, args=(storage, "study", definition, 6))
+    entered = threading.Thread(target=Search.enter, args=(storage, "study", definition, 6))
     entered.start()
     for _ in range(8):
         time.sleep(0.4)

@@ -1,4 +1,4 @@
-"""What a user sees while a study goes on."""
+"""The progress of a search, as a user sees it."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 if TYPE_CHECKING:
     from sb3_sparse.tuning.backend import FrozenTrial
-    from sb3_sparse.tuning.study import Status
+    from sb3_sparse.tuning.search import SearchStatus
 
 
 def values_in_words(trial: FrozenTrial) -> str:
-    """A trial's values in a line."""
+    """Return a trial's values in a line."""
     values = trial.user_attrs.get("hyperparams", trial.params)
     return ", ".join(f"{name} {_short(value)}" for name, value in values.items())
 
@@ -23,9 +23,9 @@ def _short(value: object) -> str:
 
 
 class TuningProgress:
-    """A line for each trial that ends, and below them a bar with the best so far.
+    """Print a line for each trial that ends, above a bar with the best so far.
 
-    :param console: where to print; one that is no terminal gets the lines alone
+    :param console: where to print; if it is not a terminal, it gets the lines only
     """
 
     def __init__(self, console: Console) -> None:
@@ -41,8 +41,8 @@ class TuningProgress:
         )
         self.task = self.bar.add_task("", total=None, status="starting")
 
-    def __call__(self, status: Status) -> None:
-        """Show how far it is."""
+    def __call__(self, status: SearchStatus) -> None:
+        """Show how far the search is."""
         if self.seen is None:
             self.seen = {trial.number for trial in status.done}
             self.bar.start()
@@ -57,7 +57,7 @@ class TuningProgress:
         self.bar.update(self.task, completed=len(status.done), total=status.planned, status=running)
 
     @staticmethod
-    def _line(trial: FrozenTrial, status: Status) -> str:
+    def _line(trial: FrozenTrial, status: SearchStatus) -> str:
         if trial in status.failed:
             return (
                 f"trial {trial.number} failed: {trial.user_attrs.get('error', 'no reason known')}"
@@ -70,5 +70,5 @@ class TuningProgress:
         return f"{count}: trial {trial.number} {how} {value}{so_far}; {values_in_words(trial)}"
 
     def close(self) -> None:
-        """Give the terminal back, also after an interruption."""
+        """Give the terminal back."""
         self.bar.stop()
