@@ -135,7 +135,7 @@ def test_a_zip_alone(monkeypatch, capsys, tmp_path):
         (["no.zip"], "there is no file"),
         (
             ["model.zip", "--to", "tflite"],
-            "to must be one of 'c', 'numpy', 'onnx', 'dense', got 'tflite'",
+            "unknown export format 'tflite'; allowed are c, numpy, onnx, dense",
         ),
         (["model.zip", "--to", "onnx", "--int8"], "int8 is for to='c' only"),
         (["model.zip", "--vecnormalize", "no.pkl"], "there is no file no.pkl; give what"),

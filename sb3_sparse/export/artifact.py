@@ -1,4 +1,4 @@
-"""What each format writes, and how it is run to be checked."""
+"""The files of each format, and how they are run for the check."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import subprocess
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -38,12 +39,12 @@ OPTIONS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror")
 
 @dataclass(frozen=True)
 class Artifact:
-    """An exported policy, not yet on disk.
+    """An exported policy that is not on disk yet.
 
     :param files: contents by name; a name that begins with a dot is the suffix of the main file
-    :param actor: runs it
-    :param notes: what its user must know
-    :param sizes: bytes of what it takes where it runs, by kind
+    :param actor: returns a function that runs it
+    :param notes: what the user must know
+    :param sizes: bytes needed where it runs, by kind
     """
 
     files: dict[str, bytes]
@@ -52,9 +53,9 @@ class Artifact:
     sizes: dict[str, int] = field(default_factory=dict)
 
 
-def c_artifact(graph: Graph, version: str, int8: bool) -> Artifact:
-    """A C file and its header."""
-    written = write_c(sort_units(graph), version, int8)
+def c_artifact(graph: Graph, int8: bool) -> Artifact:
+    """Write a C file and its header."""
+    written = write_c(sort_units(graph), version("sb3-sparse"), int8)
     return Artifact(
         {".c": written.source.encode(), ".h": written.header.encode()},
         lambda: compiled(written.source, graph),
@@ -62,8 +63,8 @@ def c_artifact(graph: Graph, version: str, int8: bool) -> Artifact:
     )
 
 
-def numpy_artifact(graph: Graph) -> Artifact:
-    """A .npz file and its loader."""
+def numpy_artifact(graph: Graph, int8: bool) -> Artifact:
+    """Write an .npz file and its loader."""
     content = write_npz(graph)
     loader = Path(numpy_policy.__file__).read_bytes()
 
@@ -76,7 +77,7 @@ def numpy_artifact(graph: Graph) -> Artifact:
                 observations = np.reshape(observations, (count, *graph.observation_shape))
             actions = policy(observations).reshape(count, -1)
             first = row_of(observations, 0)
-            actions[0] = np.reshape(policy(first), -1)  # one alone is served as well
+            actions[0] = np.reshape(policy(first), -1)  # a single observation must work, too
             return np.asarray(actions)
 
         return run
@@ -84,11 +85,13 @@ def numpy_artifact(graph: Graph) -> Artifact:
     return Artifact({".npz": content, Path(numpy_policy.__file__).name: loader}, actor)
 
 
-def onnx_artifact(graph: Graph, version: str) -> Artifact:
-    """An ONNX model."""
-    from sb3_sparse.export.onnx_model import inputs_of, write_onnx
-
-    content = write_onnx(graph, version)
+def onnx_artifact(graph: Graph, int8: bool) -> Artifact:
+    """Write an ONNX model."""
+    try:
+        from sb3_sparse.export.onnx_model import inputs_of, write_onnx
+    except ImportError as error:
+        raise MissingExtra("exporting to ONNX", "export") from error
+    content = write_onnx(graph, version("sb3-sparse"))
 
     def actor() -> Actor:
         try:
@@ -111,10 +114,18 @@ def onnx_artifact(graph: Graph, version: str) -> Artifact:
     return Artifact({".onnx": content}, actor)
 
 
-def dense_artifact(model: BaseAlgorithm, normalised: bool) -> Artifact:
-    """A zip of stock SB3.
+GRAPH_ARTIFACTS: dict[str, Callable[[Graph, bool], Artifact]] = {
+    "c": c_artifact,
+    "numpy": numpy_artifact,
+    "onnx": onnx_artifact,
+}
+"""Writers by format: from a graph, and whether weights are 8-bit numbers (in C only)."""
 
-    :param normalised: whether a VecNormalize stands before the model
+
+def dense_artifact(model: BaseAlgorithm, normalised: bool) -> Artifact:
+    """Write a zip of stock SB3.
+
+    :param normalised: whether the model was trained on observations that VecNormalize normalised
     """
     content = write_dense(model)
 
@@ -130,20 +141,20 @@ def dense_artifact(model: BaseAlgorithm, normalised: bool) -> Artifact:
             ) from error
         return predictor(stock, None)
 
-    notes = ["trained on in stock SB3, it is dense: nothing keeps the zeros"]
+    notes = ["if stock SB3 trains it further, it becomes dense: nothing keeps the zeros"]
     if normalised:
         notes.append(
             "a zip of SB3 does not normalise observations: load the statistics with "
-            "VecNormalize.load, as before"
+            "VecNormalize.load, as for the model"
         )
     policy = unwrapped(model.policy)
     if isinstance(policy, BaseSparsePolicy) and policy.sparse.weight_decay:
-        notes.append("weight_decay, which is of sparse policies, is left out")
+        notes.append("weight_decay is left out: only sparse policies have it")
     return Artifact({".zip": content}, actor, tuple(notes))
 
 
 def predictor(model: BaseAlgorithm, normalization: VecNormalize | None) -> Actor:
-    """A model's own ``predict``, behind its normalisation."""
+    """Return a function that normalises observations and calls the model's ``predict``."""
 
     def run(observations: Observations) -> NDArray[Any]:
         seen = observations
@@ -156,14 +167,14 @@ def predictor(model: BaseAlgorithm, normalization: VecNormalize | None) -> Actor
 
 
 def compiler() -> list[str]:
-    """The command of this machine's C compiler: ``$CC``, else cc, gcc or clang.
+    """Return the command of a C compiler: ``$CC``, else cc, gcc or clang.
 
     :raises UnsupportedError: if there is none
     """
     try:
         command = shlex.split(os.environ.get("CC", ""))
     except ValueError as error:
-        raise UnsupportedError(f"CC={os.environ['CC']!r} is no command: {error}") from error
+        raise UnsupportedError(f"CC={os.environ['CC']!r} is not a command: {error}") from error
     names = [command[0]] if command else list(COMPILERS)
     for name in names:
         found = shutil.which(name)
@@ -171,15 +182,15 @@ def compiler() -> list[str]:
             return [found, *command[1:]]
     raise UnsupportedError(
         f"a C export is compiled and run to check it, but there is no {' or '.join(names)} here; "
-        "install gcc or clang, name a compiler in the environment variable CC, or write it "
+        "install gcc or clang, name a compiler in the environment variable CC, or write the export "
         "unchecked with force (--force)"
     )
 
 
 def compiled(source: str, graph: Graph, options: tuple[str, ...] = OPTIONS) -> Actor:
-    """Compile a policy and run it through ctypes.
+    """Compile a policy; return a function that calls it through ctypes.
 
-    :param graph: for the sizes of observation and action
+    :param graph: gives the sizes of observation and action
     """
     with tempfile.TemporaryDirectory() as folder:
         path, library = Path(folder) / "policy.c", Path(folder) / "policy.so"
@@ -189,7 +200,7 @@ def compiled(source: str, graph: Graph, options: tuple[str, ...] = OPTIONS) -> A
         if done.returncode:
             raise UnsupportedError(
                 f"{shlex.join(command[:1])} cannot compile the C export (exit code "
-                f"{done.returncode}): {done.stderr.strip() or 'it says nothing'}. Name another "
+                f"{done.returncode}): {done.stderr.strip() or 'no message'}. Name another "
                 "compiler in CC, or write it unchecked with force (--force)"
             )
         try:

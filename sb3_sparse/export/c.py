@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_sparse.export import ckernels
-from sb3_sparse.export.cheader import PROTOTYPE, WIDTH, about, declarations
 from sb3_sparse.export.graph import Graph
 from sb3_sparse.export.layout import grouped, side_by_side
 from sb3_sparse.export.memory import Memory, bordered_shape, plan_memory
@@ -35,6 +34,8 @@ from sb3_sparse.export.nodes import (
 )
 from sb3_sparse.export.quantize import quantize_rows
 
+PROTOTYPE = "void sb3_sparse_policy(const float *obs, float *action)"
+WIDTH = 100
 BYTES = {"float": 4, "int8_t": 1, "uint16_t": 2, "uint32_t": 4}
 
 
@@ -44,8 +45,8 @@ class CSource:
 
     :param source: text of the ``.c`` file
     :param header: text of the ``.h`` file
-    :param flash: bytes of its constants; the code comes on top, some 1 to 3 KB
-    :param ram: bytes of its static memory; observation and action are the caller's
+    :param flash: bytes of its constants, without some 1 to 3 KB of code
+    :param ram: bytes of its static memory, without the caller's observation and action
     """
 
     source: str
@@ -55,11 +56,11 @@ class CSource:
 
 
 def write_c(graph: Graph, version: str, int8: bool = False) -> CSource:
-    """C99 of a graph.
+    """Write a graph as C99.
 
-    :param graph: the policy; its hidden units are best sorted
-    :param version: of this package, for the files' first lines
-    :param int8: weights as 8-bit whole numbers with a scale for each row.
+    :param graph: the policy; its hidden units should be sorted
+    :param version: version of this package, for the files' first lines
+    :param int8: store weights as 8-bit whole numbers with a scale for each row
     """
     writer = _Writer(graph, plan_memory(graph), int8)
     for number, node in enumerate(graph.nodes):
@@ -69,7 +70,7 @@ def write_c(graph: Graph, version: str, int8: bool = False) -> CSource:
     body = "\n".join(f"    {line}" for line in writer.calls)
     ram = 4 * writer.memory.size
     memory = f"static float memory[{writer.memory.size}];\n\n" if ram else ""
-    comment = about(graph, version, writer.flash, ram)
+    comment = _about(graph, version, writer.flash, ram)
     includes = "#include <stdint.h>\n"
     if any(f"{name}(" in functions for name in ckernels.MATH):
         includes = "#include <math.h>\n" + includes
@@ -77,7 +78,7 @@ def write_c(graph: Graph, version: str, int8: bool = False) -> CSource:
         f"{comment}{includes}\n{PROTOTYPE};\n\n{memory}{functions}\n{tables}\n\n"
         f"{PROTOTYPE}\n{{\n{body}\n}}\n"
     )
-    header = comment + declarations(graph)
+    header = comment + _declarations(graph)
     return CSource(source, header, writer.flash, ram)
 
 
@@ -94,7 +95,7 @@ class _Writer:
         self.calls: list[str] = []
 
     def write(self, value: int, node: Node) -> None:
-        """Append what computes a node's result."""
+        """Append the code that computes a node's result."""
         self.value = value
         x, y = self._place(node.inputs[0]), self._place(value)
         if isinstance(node, Linear):
@@ -103,42 +104,43 @@ class _Writer:
             self._conv(node, x, y)
         elif isinstance(node, MaxPool):
             self._max_pool(node, x, y)
-        elif isinstance(node, Argmax):
-            self.functions["argmax"] = ckernels.ARGMAX
+        elif isinstance(node, (Argmax, OneHot)):
             sizes = self._table("sizes", node.sizes, "uint32_t")
-            self.calls.append(f"argmax({x}, {y}, {len(node.sizes)}, {sizes});")
-        elif isinstance(node, OneHot):
-            self.functions["one_hot"] = ckernels.ONE_HOT
-            sizes = self._table("sizes", node.sizes, "uint32_t")
-            self.calls.append(f"one_hot({x}, {y}, {len(node.sizes)}, {sizes});")
+            self._call(node.op, x, y, len(node.sizes), sizes)
         elif isinstance(node, Standardize):
-            self.functions["standardize"] = ckernels.STANDARDIZE
-            self.calls.append(f"standardize({x}, {y}, {_size(node)}, {_number(node.eps)});")
+            self._call("standardize", x, y, _size(node), _number(node.eps))
         elif isinstance(node, Concat):
-            self.functions["copy_each"] = ckernels.COPY
             start = 0
             for part in node.inputs:
                 size = int(np.prod(self.graph.shape_of(part)))
-                self.calls.append(f"copy_each({self._place(part)}, {y} + {start}, {size});")
+                self._call("copy_each", self._place(part), f"{y} + {start}", size)
                 start += size
         elif isinstance(node, PerUnit):
             places = int(np.prod(node.shape[1:]))
-            self._elementwise(node, x, y, f"{node.shape[0]}, {places}", node.fields())
+            self._elementwise(node, x, y, [node.shape[0], places], node.fields())
         elif isinstance(node, Normalize):
             fields = node.fields()
             fields["clip"] = np.array(node.clip, np.float32)
-            self._elementwise(node, x, y, _size(node), fields)
+            self._elementwise(node, x, y, [_size(node)], fields)
         elif isinstance(node, Activation):
-            self._elementwise(node, x, y, _size(node), node.fields())
+            self._elementwise(node, x, y, [_size(node)], node.fields())
         elif isinstance(node, (Add, Multiply)):
-            self._elementwise(node, x, y, f"{_size(node)}, {self._place(node.inputs[1])}", {})
+            self._elementwise(node, x, y, [_size(node), self._place(node.inputs[1])], {})
         elif isinstance(node, Positive):
-            self._elementwise(node, x, y, _size(node), {})
+            self._elementwise(node, x, y, [_size(node)], {})
         else:
             assert isinstance(node, (Flatten, Slice))  # the same numbers in the same order
 
+    def _call(self, function: str, *arguments: object, source: str = "") -> None:
+        """Append a call.
+
+        :param source: text of the function; by default that in :data:`ckernels.FUNCTIONS`
+        """
+        self.functions[function] = source or ckernels.FUNCTIONS[function]
+        self.calls.append(f"{function}({', '.join(map(str, arguments))});")
+
     def _elementwise(
-        self, node: Node, x: str, y: str, size: str, fields: dict[str, NDArray[Any]]
+        self, node: Node, x: str, y: str, size: list[object], fields: dict[str, NDArray[Any]]
     ) -> None:
         arguments = [
             self._table(name, field, "float") if field.ndim else _number(field)
@@ -149,20 +151,16 @@ class _Writer:
         for name, helper in ckernels.HELPERS.items():
             if f"{name}(" in function:
                 self.functions[name] = helper
-        self.functions[kind] = function
-        self.calls.append(f"{ckernels.c_name(kind)}({', '.join([x, y, size, *arguments])});")
+        self._call(ckernels.c_name(kind), x, y, *size, *arguments, source=function)
 
     def _linear(self, layer: Linear, x: str, y: str) -> None:
         rows, scales = self._rows(layer)
         bits = self._bits(layer.weight.shape[1])
         if rows.size * self._width <= np.count_nonzero(rows) * (self._width + bits // 8):
-            name = "linear_dense" + "_int8" * self.int8
-            self.functions[name] = ckernels.linear(name, None, self.int8)
-            tables = [self._table("value", side_by_side(rows), self._type)]
-            size = f"{rows.shape[0]}, {rows.shape[1]}"
+            name, source_bits = "linear_dense" + "_int8" * self.int8, None
+            tables = [str(rows.shape[1]), self._table("value", side_by_side(rows), self._type)]
         else:
-            name = f"linear_{bits}" + "_int8" * self.int8
-            self.functions[name] = ckernels.linear(name, bits, self.int8)
+            name, source_bits = f"linear_{bits}" + "_int8" * self.int8, bits
             lengths, columns, values = grouped(rows)
             index = ckernels.INDEX_TYPES[bits]
             tables = [
@@ -170,11 +168,9 @@ class _Writer:
                 self._table("column", columns, index),
                 self._table("value", values, self._type),
             ]
-            size = str(rows.shape[0])
-        if self.int8:
-            tables.append(self._table("scale", scales, "float"))
-        tables.append(self._table("bias", layer.bias, "float"))
-        self.calls.append(f"{name}({', '.join([x, y, size, *tables])});")
+        tables += self._scale_and_bias(layer, scales)
+        source = ckernels.linear(name, source_bits, self.int8)
+        self._call(name, x, y, len(rows), *tables, source=source)
 
     def _conv(self, layer: Conv, x: str, y: str) -> None:
         x, shape = self._bordered(layer, x, 0.0)
@@ -186,7 +182,6 @@ class _Writer:
         full = bool((rows != 0).all())
         index = ckernels.INDEX_TYPES[bits]
         name = f"conv_{bits}" + "_full" * full + "_int8" * self.int8
-        self.functions[name] = ckernels.conv(name, bits, full, self.int8)
         active = [np.flatnonzero(row) for row in rows]
         if full:
             tables = [str(rows.shape[1]), self._table("offset", places, index)]
@@ -197,35 +192,32 @@ class _Writer:
             ]
         values = np.concatenate([row[found] for row, found in zip(rows, active, strict=True)])
         tables.append(self._table("value", values, self._type))
-        if self.int8:
-            tables.append(self._table("scale", scales, "float"))
-        tables.append(self._table("bias", layer.bias, "float"))
-        units, rows_out, columns_out = layer.shape
-        down, right = across * layer.stride[0], layer.stride[1]
-        size = f"{units}, {rows_out}, {columns_out}, {down}, {right}"
-        self.calls.append(f"{name}({', '.join([x, y, size, *tables])});")
+        tables += self._scale_and_bias(layer, scales)
+        steps = (across * layer.stride[0], layer.stride[1])
+        source = ckernels.conv(name, bits, full, self.int8)
+        self._call(name, x, y, *layer.shape, *steps, *tables, source=source)
+
+    def _scale_and_bias(self, layer: Weighted, scales: NDArray[Any]) -> list[str]:
+        scale = [self._table("scale", scales, "float")] if self.int8 else []
+        return [*scale, self._table("bias", layer.bias, "float")]
 
     def _max_pool(self, node: MaxPool, x: str, y: str) -> None:
-        self.functions["max_pool"] = ckernels.MAX_POOL
         x, (_, height, width) = self._bordered(node, x, -float(np.finfo(np.float32).max))
         sizes = [*node.shape, height * width, width, width * node.stride[0], node.stride[1]]
-        numbers = ", ".join(map(str, [*sizes, *node.kernel]))
-        self.calls.append(f"max_pool({x}, {y}, {numbers});")
+        self._call("max_pool", x, y, *sizes, *node.kernel)
 
     def _bordered(self, node: Conv | MaxPool, x: str, border: float) -> tuple[str, tuple[int, ...]]:
-        """A node's input with a border around, where it needs one, and the shape of that."""
+        """Add a border to a node's input if it needs one; return the input and its shape."""
         shape = self.graph.shape_of(node.inputs[0])
         with_border = bordered_shape(node, shape)
         if with_border is None:
             return x, shape
-        self.functions["bordered"] = ckernels.BORDERED
         y = f"memory + {self.memory.borders[self.value]}"
-        sizes = ", ".join(map(str, [*shape, *node.padding]))
-        self.calls.append(f"bordered({x}, {y}, {sizes}, {_number(border)});")
+        self._call("bordered", x, y, *shape, *node.padding, _number(border))
         return y, with_border
 
     def _rows(self, layer: Weighted) -> tuple[NDArray[Any], NDArray[Any]]:
-        """A layer's weights as they are written, by rows, and the scale of each row."""
+        """Return a layer's weights as they are written, by rows, and the scale of each row."""
         if self.int8:
             return quantize_rows(layer.rows)
         return layer.rows, np.ones(len(layer.rows), np.float32)
@@ -254,7 +246,7 @@ class _Writer:
         return f"memory + {self.memory.places[value]}"
 
     def _table(self, name: str, numbers: Any, kind: str) -> str:
-        """Append a constant array; its name."""
+        """Append a constant array and return its name."""
         flat = np.asarray(numbers).reshape(-1)
         name = f"{name}_{self.value}"
         if not flat.size:
@@ -270,7 +262,7 @@ class _Writer:
 
 
 def _number(value: Any) -> str:
-    """A float's shortest literal that C reads back as the same one."""
+    """Return the shortest literal that C reads back as the same float."""
     largest = np.finfo(np.float32).max  # C has no literal for infinity
     text = str(np.float32(np.clip(value, -largest, largest)))
     return f"{text}f" if "." in text or "e" in text else f"{text}.0f"
@@ -278,3 +270,48 @@ def _number(value: Any) -> str:
 
 def _size(node: Node) -> str:
     return str(int(np.prod(node.shape)))
+
+
+def _about(graph: Graph, version: str, flash: int, ram: int) -> str:
+    """Return the comment that both files begin with."""
+    lines = [
+        f"A policy of {graph.nnz} connections, written by sb3_sparse {version}.",
+        f"Flash: {flash} bytes of constants, and the code. RAM: {ram} bytes, no heap.",
+        *textwrap.wrap(f"In: one observation of {_asked(graph)}, raw.", WIDTH - 3),
+        f"Out: {_given(graph)}.",
+    ]
+    return "/*\n" + "".join(f" * {line}\n" for line in lines).replace("*/", "* /") + " */\n"
+
+
+def _declarations(graph: Graph) -> str:
+    """Return the header without its comment."""
+    return (
+        "#ifndef SB3_SPARSE_POLICY_H\n#define SB3_SPARSE_POLICY_H\n\n"
+        f"#define SB3_SPARSE_OBSERVATION_SIZE {int(np.prod(graph.observation_shape))}\n"
+        f"#define SB3_SPARSE_ACTION_SIZE {graph.nodes[-1].shape[0]}\n\n"
+        '#ifdef __cplusplus\nextern "C" {\n#endif\n\n'
+        "/* Not reentrant: its intermediate values are static. */\n"
+        f"{PROTOTYPE};\n\n"
+        "#ifdef __cplusplus\n}\n#endif\n\n#endif\n"
+    )
+
+
+def _shape(shape: tuple[int, ...]) -> str:
+    return "x".join(map(str, shape))
+
+
+def _asked(graph: Graph) -> str:
+    if not graph.parts:
+        return _shape(graph.observation_shape)
+    parts = [f"{part.key!r} ({_shape(part.shape or (1,))})" for part in graph.parts]
+    return f"{graph.observation_shape[0]} numbers: {', then '.join(parts)}"
+
+
+def _given(graph: Graph) -> str:
+    last, actions = graph.nodes[-1], graph.nodes[-1].shape[0]
+    if isinstance(last, Argmax):
+        choices = ", ".join(map(str, last.sizes))
+        return f"{actions} whole number{'s' * (actions > 1)}, below {choices}"
+    if isinstance(last, Positive):
+        return f"{actions} times 0 or 1"
+    return f"{actions} number{'s' * (actions > 1)}, within the action space's bounds"

@@ -1,4 +1,4 @@
-"""The C functions that an exported policy is made of; only those that it calls are written."""
+"""The C functions of exported policies; a policy contains only those it calls."""
 
 from __future__ import annotations
 
@@ -141,10 +141,11 @@ static float log1p_exp(float x)
 }
 """,
 }
-"""What expressions may call."""
+"""Functions that expressions may call."""
 MATH = ("tanhf", "expm1f", "expf", "erff", "fabsf", "log1pf", "sqrtf")
-"""What needs ``math.h``."""
-BORDERED = """\
+"""Functions of ``math.h``."""
+FUNCTIONS = {
+    "bordered": """\
 static void bordered(const float *x, float *y, uint32_t units, uint32_t height, uint32_t width,
                      uint32_t above, uint32_t left, float border)
 {
@@ -155,8 +156,8 @@ static void bordered(const float *x, float *y, uint32_t units, uint32_t height, 
                 *y++ = row >= above && row < height + above && column >= left &&
                        column < width + left ? *x++ : border;
 }
-"""
-MAX_POOL = """\
+""",
+    "max_pool": """\
 static void max_pool(const float *x, float *y, uint32_t units, uint32_t height, uint32_t width,
                      uint32_t size, uint32_t across, uint32_t down, uint32_t right,
                      uint32_t rows, uint32_t columns)
@@ -174,16 +175,16 @@ static void max_pool(const float *x, float *y, uint32_t units, uint32_t height, 
                 *y++ = most;
             }
 }
-"""
-COPY = """\
+""",
+    "copy_each": """\
 static void copy_each(const float *x, float *y, uint32_t n)
 {
     uint32_t i;
     for (i = 0; i < n; i++)
         y[i] = x[i];
 }
-"""
-STANDARDIZE = """\
+""",
+    "standardize": """\
 static void standardize(const float *x, float *y, uint32_t n, float eps)
 {
     float mean = 0.0f, square = 0.0f;
@@ -197,8 +198,8 @@ static void standardize(const float *x, float *y, uint32_t n, float eps)
     for (i = 0; i < n; i++)
         y[i] = (x[i] - mean) / square;
 }
-"""
-ONE_HOT = """\
+""",
+    "one_hot": """\
 static void one_hot(const float *x, float *y, uint32_t n, const uint32_t *size)
 {
     uint32_t i;
@@ -206,8 +207,8 @@ static void one_hot(const float *x, float *y, uint32_t n, const uint32_t *size)
         for (i = 0; i < *size; i++)
             *y++ = *x == (float)i ? 1.0f : 0.0f;
 }
-"""
-ARGMAX = """\
+""",
+    "argmax": """\
 static void argmax(const float *x, float *y, uint32_t n, const uint32_t *size)
 {
     for (; n; n--, x += *size++) {
@@ -218,13 +219,15 @@ static void argmax(const float *x, float *y, uint32_t n, const uint32_t *size)
         *y++ = (float)best;
     }
 }
-"""
+""",
+}
+"""Functions that are written as they are."""
 
 
 def linear(name: str, bits: int | None, int8: bool) -> str:
-    """A linear layer.
+    """Return the function of a linear layer.
 
-    :param bits: of an index; None: a dense layer
+    :param bits: bits of an index; None: a dense layer
     :param int8: whether weights are whole numbers with a scale for each row
     """
     position = "n" if bits is None else "column[{i}]"
@@ -246,9 +249,9 @@ def linear(name: str, bits: int | None, int8: bool) -> str:
 
 
 def conv(name: str, bits: int, full: bool, int8: bool) -> str:
-    """A convolution.
+    """Return the function of a convolution.
 
-    :param bits: of an offset
+    :param bits: bits of an offset
     :param full: whether all units have every connection, and so share their offsets
     :param int8: as for :func:`linear`
     """
@@ -266,16 +269,15 @@ def conv(name: str, bits: int, full: bool, int8: bool) -> str:
 
 
 def elementwise(name: str) -> str:
-    """A function of :data:`ELEMENTWISE` or :data:`PER_UNIT`."""
+    """Return the function of an operation of :data:`ELEMENTWISE` or :data:`PER_UNIT`."""
     per_unit = name in PER_UNIT
     parameters, expression = (PER_UNIT if per_unit else ELEMENTWISE)[name]
     template = _PLACE_BY_PLACE if per_unit else _UNIT_BY_UNIT
-    function = template.substitute(name=c_name(name), parameters=parameters, expression=expression)
-    return function
+    return template.substitute(name=c_name(name), parameters=parameters, expression=expression)
 
 
 def c_name(name: str) -> str:
-    """The C function of an elementwise operation; none has the name of one in ``math.h``."""
+    """Return the name of an elementwise function, different from all names of ``math.h``."""
     return f"{name}_each"
 
 

@@ -1,4 +1,4 @@
-"""The forms that a policy can be exported to, by name."""
+"""The names of the export formats, known without importing torch."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ FORMATS = ("c", "numpy", "onnx", "dense")
 
 
 def check_format(to: object) -> None:
-    """Refuse a form that there is not.
+    """Reject an unknown format.
 
-    :raises ConfigError: if so
+    :raises ConfigError: if ``to`` is not one of :data:`FORMATS`
     """
     if to not in FORMATS:
         raise ConfigError(
-            f"to must be one of {', '.join(map(repr, FORMATS))}, got {to!r}"
-            f"{did_you_mean(to, FORMATS)}"
+            f"unknown export format {to!r}{did_you_mean(to, FORMATS)}; "
+            f"allowed are {', '.join(FORMATS)}"
         )

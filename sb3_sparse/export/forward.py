@@ -1,18 +1,18 @@
-"""Through the ``forward`` of a user's own module, if it is simple enough."""
+"""Translates the ``forward`` of a user's own module, if it is simple enough."""
 
 from __future__ import annotations
 
 import operator
-from collections.abc import Mapping
-from typing import Any, Protocol
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 import torch as th
 from torch import fx, nn
 
-from sb3_sparse.errors import UnsupportedError
 from sb3_sparse.export.activations import called, scaled
-from sb3_sparse.export.nodes import Add, Multiply, Node
+from sb3_sparse.export.builder import GraphBuilder
+from sb3_sparse.export.nodes import Add, Multiply
 
 ADD = (operator.add, operator.iadd, th.add, "add", "add_")
 SUBTRACT = (operator.sub, operator.isub, th.sub, "sub", "sub_")
@@ -25,44 +25,25 @@ SQUARE = (operator.pow, th.pow, "pow", th.square, "square")
 RESHAPE = ("view", "reshape", th.reshape)
 
 
-class Tracer(Protocol):
-    """Collects operations while it walks through modules."""
-
-    changed: set[int]
-    """Values that torch changes in place."""
-
-    def walk(self, module: nn.Module, value: int | Mapping[str, int]) -> int:
-        """The result of a module applied to a value, or to a dict of values."""
-
-    def add(self, node: Node) -> int:
-        """Append an operation; the number of its result."""
-
-    def concat(self, values: list[int]) -> int:
-        """Values one after the other."""
-
-    def shape_of(self, value: int) -> tuple[int, ...]:
-        """Shape of a value so far."""
-
-    def sources(self, value: int) -> list[int]:
-        """A value, and what it is another view of."""
-
-    def refusal(self, module: nn.Module, why: str = "") -> UnsupportedError:
-        """The error for a module, which it names."""
+Walk = Callable[[nn.Module, int], int]
 
 
-def trace_forward(tracer: Tracer, module: nn.Module, value: int | Mapping[str, int]) -> int:
-    """The result of a module applied to a value, or to a dict of values.
+def trace_forward(
+    builder: GraphBuilder, walk: Walk, module: nn.Module, value: int | Mapping[str, int]
+) -> int:
+    """Apply a module to a value, or to a dict of values, and return the result.
 
-    :raises UnsupportedError: if its ``forward`` does what cannot be exported
+    :param walk: applies a module that ``forward`` calls
+    :raises UnsupportedError: if the module's ``forward`` does what cannot be exported
     """
     try:
         graph = _Leaves().trace(module)
     except Exception as error:  # whatever a forward does that cannot be traced
-        raise tracer.refusal(module, f"its forward cannot be traced ({error})") from error
+        raise builder.refusal(module, f"its forward cannot be traced ({error})") from error
     values: dict[fx.Node, int] = {}
     observation: fx.Node | None = None
     sizes: set[fx.Node] = set()
-    """What stands for the size of a batch, or for a shape, whose first number that is."""
+    """Nodes that hold the batch size, or a shape, which begins with it."""
     for node in graph.nodes:
         taken = [values.get(arg) for arg in node.all_input_nodes]
         first = taken[0] if taken else None
@@ -77,78 +58,82 @@ def trace_forward(tracer: Tracer, module: nn.Module, value: int | Mapping[str, i
         elif node.op == "output" and node.args[0] in values:
             return values[node.args[0]]
         elif node.op == "call_module" and len(taken) == 1 and first is not None:
-            found = tracer.walk(module.get_submodule(str(node.target)), first)
+            found = walk(module.get_submodule(str(node.target)), first)
         elif _is_size(node, sizes):
             sizes.add(node)
             continue
         elif node.op in ("call_function", "call_method") and first is not None:
-            found = _call(tracer, node, values, sizes)
+            found = _call(builder, walk, node, values, sizes)
         if found is None:
-            raise tracer.refusal(module, f"its forward {_said(node)}")
+            raise builder.refusal(module, f"its forward {_description(node)}")
         values[node] = found
     raise AssertionError("a graph has an output")
 
 
 class _Leaves(fx.Tracer):
-    """Traces one module's ``forward`` and nothing below."""
+    """Traces the ``forward`` of one module, not of its children."""
 
     def is_leaf_module(self, m: nn.Module, module_qualified_name: str) -> bool:
         return True
 
 
 def _call(
-    tracer: Tracer, node: fx.Node, values: dict[fx.Node, int], sizes: set[fx.Node]
+    builder: GraphBuilder,
+    walk: Walk,
+    node: fx.Node,
+    values: dict[fx.Node, int],
+    sizes: set[fx.Node],
 ) -> int | None:
-    """The result of a function or method; None if it cannot be exported."""
+    """Return the result of a function or method; None if it cannot be exported."""
     target: Any = node.target
     arguments = list(node.args)
     options = dict(node.kwargs)
     inputs = [values[arg] for arg in arguments if isinstance(arg, fx.Node) and arg in values]
     if target in CONCAT:
-        return _concat(tracer, arguments, options, values)
+        return _concat(builder, arguments, options, values)
     in_place = options.pop("inplace", False) or target in IN_PLACE or str(target).endswith("_")
     if in_place:
-        tracer.changed.update(tracer.sources(inputs[0]))
+        builder.changed.update(builder.sources(inputs[0]))
     if target in RESHAPE:
-        flat = _flattens(tracer, inputs[0], arguments[1:], sizes) and not options
-        return tracer.walk(nn.Flatten(), inputs[0]) if flat else None
+        flat = _flattens(builder, inputs[0], arguments[1:], sizes) and not options
+        return walk(nn.Flatten(), inputs[0]) if flat else None
     if target in SQUARE and arguments[1:] in ([], [2]) and not options:
-        return tracer.add(Multiply((inputs[0], inputs[0]), tracer.shape_of(inputs[0])))
+        return builder.add(Multiply((inputs[0], inputs[0]), builder.shape_of(inputs[0])))
     if len(inputs) == 2 and len(arguments) == 2 and target in (*ADD, *MULTIPLY) and not options:
-        shape = tracer.shape_of(inputs[0])
-        if shape != tracer.shape_of(inputs[1]):
+        shape = builder.shape_of(inputs[0])
+        if shape != builder.shape_of(inputs[1]):
             return None
         kind = Add if target in ADD else Multiply
-        return tracer.add(kind((inputs[0], inputs[1]), shape))
+        return builder.add(kind((inputs[0], inputs[1]), shape))
     if len(inputs) != 1 or len(node.all_input_nodes) != 1:
         return None
     (value,) = inputs
     factor_and_shift = None if options else _arithmetic(target, arguments)
     if factor_and_shift is not None:
         for make in scaled(*factor_and_shift):
-            value = tracer.add(make(value, tracer.shape_of(value)))
+            value = builder.add(make(value, builder.shape_of(value)))
         return value
     made = called(target, arguments[1:], options)
-    return None if made is None else tracer.walk(made, value)
+    return None if made is None else walk(made, value)
 
 
 def _concat(
-    tracer: Tracer, arguments: list[Any], options: dict[str, Any], values: dict[fx.Node, int]
+    builder: GraphBuilder, arguments: list[Any], options: dict[str, Any], values: dict[fx.Node, int]
 ) -> int | None:
-    """Values behind each other, if they are so along the first axis of an observation."""
+    """Concatenate values, if they are joined along the first axis of an observation."""
     parts, *rest = arguments
     axis = options.get("dim", rest[0] if rest else 0)
     if not isinstance(parts, (list, tuple)) or any(part not in values for part in parts):
         return None
     found = [values[part] for part in parts]
-    shapes = [tracer.shape_of(value) for value in found]
+    shapes = [builder.shape_of(value) for value in found]
     if axis not in (1, -len(shapes[0])) or len({shape[1:] for shape in shapes}) > 1:
         return None
-    return tracer.concat(found)
+    return builder.concat(found)
 
 
 def _arithmetic(target: Any, arguments: list[Any]) -> tuple[float, float] | None:
-    """What a value is multiplied by, and what is added; None if it is no such operation."""
+    """Return factor and summand of an arithmetic operation; None for any other."""
     if target in NEGATE:
         return -1.0, 0.0
     if len(arguments) != 2:
@@ -169,33 +154,33 @@ def _arithmetic(target: Any, arguments: list[Any]) -> tuple[float, float] | None
 
 
 def _is_size(node: fx.Node, sizes: set[fx.Node]) -> bool:
-    """Whether a node leads to the batch's size, as in ``x.view(x.size(0), -1)``."""
+    """Tell whether a node leads to the batch size, as in ``x.view(x.size(0), -1)``."""
     if node.target == "size" or (node.target is getattr and node.args[1] == "shape"):
         return node.args[1:] in ((), (0,), ("shape",))
     of_a_shape = node.target is operator.getitem and node.args[0] in sizes
     return of_a_shape and node.args[1:] == (0,)
 
 
-def _flattens(tracer: Tracer, value: int, wanted: list[Any], sizes: set[fx.Node]) -> bool:
-    """Whether a new shape is that of the batch with all units in one row."""
+def _flattens(builder: GraphBuilder, value: int, wanted: list[Any], sizes: set[fx.Node]) -> bool:
+    """Tell whether a new shape keeps the batch and puts all units in one row."""
     shape = list(wanted[0]) if len(wanted) == 1 and isinstance(wanted[0], tuple) else wanted
     if len(shape) != 2:
         return False
-    units = int(np.prod(tracer.shape_of(value)))
+    units = int(np.prod(builder.shape_of(value)))
     kept = isinstance(shape[0], fx.Node) and shape[0] in sizes
     return bool((kept and shape[1] in (-1, units)) or shape == [-1, units])
 
 
-def _said(node: fx.Node) -> str:
-    """What a node does, in words."""
+def _description(node: fx.Node) -> str:
+    """Describe what a node does."""
     if node.op == "placeholder":
         return f"takes {node.target} too"
     if node.op == "output":
-        return "gives something else than one tensor"
+        return "returns something other than one tensor"
     if node.op == "get_attr":
         return f"reads {node.target}"
     if node.op == "call_module":
-        return f"calls {node.target} with something else than one tensor"
+        return f"calls {node.target} with something other than one tensor"
     target: Any = node.target
     name = target if isinstance(target, str) else getattr(target, "__name__", str(target))
     given = [repr(arg) for arg in node.args if not isinstance(arg, (fx.Node, tuple, list))]

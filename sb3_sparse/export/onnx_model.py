@@ -1,4 +1,4 @@
-"""A policy as an ONNX model."""
+"""Writes a policy as an ONNX model."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from onnx import TensorProto, checker, helper
 
-from sb3_sparse.errors import MissingExtra
 from sb3_sparse.export.graph import Graph
 from sb3_sparse.export.nodes import (
     Activation,
@@ -28,27 +28,22 @@ from sb3_sparse.export.nodes import (
     Slopes,
     Standardize,
 )
-from sb3_sparse.export.onnx_activations import write_activation
-
-try:
-    from onnx import TensorProto, checker, helper, numpy_helper
-except ImportError as error:
-    raise MissingExtra("exporting to ONNX", "export") from error
+from sb3_sparse.export.onnx_writer import OnnxWriter
 
 OPSET = 17
 IR_VERSION = 8
 
 
 def write_onnx(graph: Graph, version: str) -> bytes:
-    """Bytes of a model with one input, ``obs``, and one output, ``action``, both batched.
+    """Return the bytes of a model with one input, ``obs``, and one output, ``action``.
 
-    Observations that are dicts have an input for each key, by its name. Images are uint8, other
-    observations float32; actions are float32, or int64 where they are whole numbers. Weights are
-    dense: ONNX runtimes compute no sparse products.
+    Both are batched. A dict observation has an input for each key, named after the key. Images are
+    uint8, other observations float32; actions are float32, or int64 if they are whole numbers.
+    Weights are dense, since ONNX runtimes have no sparse products.
 
-    :param version: of this package, for the model's producer
+    :param version: version of this package, which the model names as its producer
     """
-    writer = _Writer()
+    writer = _GraphWriter()
     if graph.parts:
         rows = [
             writer.row(f"{part.key}_row", part.key, part.size, part.pixels) for part in graph.parts
@@ -82,7 +77,7 @@ def write_onnx(graph: Graph, version: str) -> bytes:
 
 
 def inputs_of(graph: Graph) -> list[tuple[str, tuple[int, ...], bool]]:
-    """Name and shape of each input of the model, and whether it is of uint8."""
+    """Return name and shape of each input of the model, and whether it is uint8."""
     if not graph.parts:
         return [("obs", graph.observation_shape, graph.images)]
     return [(part.key, part.shape or (1,), part.pixels) for part in graph.parts]
@@ -97,32 +92,17 @@ def _name(value: int, graph: Graph) -> str:
     return "obs" if value == 0 and not graph.images and not graph.parts else f"value_{value}"
 
 
-class _Writer:
-    """Collects nodes and constants."""
-
-    def __init__(self) -> None:
-        self.nodes: list[Any] = []
-        self.arrays: list[Any] = []
-
-    def node(self, kind: str, inputs: list[str], output: str, **attributes: Any) -> str:
-        """Append an ONNX node; the name of its output."""
-        self.nodes.append(helper.make_node(kind, inputs, [output], **attributes))
-        return output
-
-    def array(self, values: Any, kind: type = np.float32) -> str:
-        """Append a constant; its name."""
-        name = f"constant_{len(self.arrays)}"
-        self.arrays.append(numpy_helper.from_array(np.asarray(values, kind), name))
-        return name
+class _GraphWriter(OnnxWriter):
+    """Translates the operations of a graph."""
 
     def row(self, output: str, x: str, size: int, pixels: bool) -> str:
-        """Append what makes one row of an input; its name."""
+        """Append the nodes that flatten an input to a row, and return the row's name."""
         if pixels:
             x = self.node("Cast", [x], f"{output}_float", to=TensorProto.FLOAT)
         return self.node("Reshape", [x, self.array([-1, size], np.int64)], output)
 
     def write(self, node: Node, inputs: list[str], output: str) -> None:
-        """Append what computes a node of the graph."""
+        """Append the nodes that compute a node of the graph."""
         if isinstance(node, Linear):
             constants = [self.array(node.weight), self.array(node.bias)]
             self.node("Gemm", [*inputs, *constants], output, transB=1)
@@ -140,7 +120,7 @@ class _Writer:
                 pads=[*node.padding, *node.padding],
             )
         elif isinstance(node, Activation):
-            write_activation(self, node, inputs[0], output)
+            self.activation(node, inputs[0], output)
         elif isinstance(node, Slopes):
             slope = self.array(_batch_first(node.fields()["slope"])[0])
             self.node("PRelu", [*inputs, slope], output)
@@ -194,5 +174,5 @@ class _Writer:
 
 
 def _batch_first(field: NDArray[Any]) -> NDArray[Any]:
-    """A field of a node, whose last axis is the batch, with the batch first."""
+    """Move the batch of a node's field from the last axis to the first."""
     return np.moveaxis(field, -1, 0) if field.ndim > 1 else field

@@ -1,9 +1,8 @@
-"""From torch modules to operations."""
+"""Translates torch modules to operations."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from typing import Any, TypeGuard, TypeVar
 
 import numpy as np
@@ -12,20 +11,17 @@ from torch import nn
 
 from sb3_sparse.engine.linear import SparseLinear
 from sb3_sparse.engine.sequential import ChainedSequential
-from sb3_sparse.errors import UnsupportedError
-from sb3_sparse.export.activations import NAMES, nodes_of
+from sb3_sparse.export.activations import nodes_of
+from sb3_sparse.export.builder import GraphBuilder
 from sb3_sparse.export.forward import trace_forward
 from sb3_sparse.export.nodes import (
     Affine,
-    Concat,
     Conv,
     Flatten,
     Floats,
     Linear,
     MaxPool,
-    Node,
     Normalize,
-    Slice,
     Standardize,
 )
 from sb3_sparse.policies.compiled import unwrapped
@@ -33,49 +29,25 @@ from sb3_sparse.policies.compiled import unwrapped
 Module = TypeVar("Module", bound=nn.Module)
 
 FAR = 10.0
-"""Standard deviations from 0 at which observations are centred before anything else."""
+"""If the mean is more standard deviations from 0, observations are centred before all else."""
 RENORM = "BatchRenorm"
-"""sb3-contrib's normalisation (CrossQ), known by name: it need not be installed here."""
+"""sb3-contrib's normalisation (CrossQ), known by name since it need not be installed."""
 DROPOUTS = (nn.Dropout, nn.Dropout1d, nn.Dropout2d, nn.AlphaDropout, nn.FeatureAlphaDropout)
 OWN_FORWARDS = (SparseLinear.forward, ChainedSequential.forward)
-"""These compute what torch's do."""
-ALLOWED = (
-    f"Linear, Conv2d, MaxPool2d, Flatten, BatchNorm, LayerNorm, Dropout, {NAMES}, and modules "
-    "whose forward does nothing but call these, add, multiply, square, flatten and concatenate"
-)
+"""Methods that compute the same as torch's."""
 
 
-@dataclass
-class Tracer:
-    """Collects operations while it walks through modules.
-
-    :param observation_shape: of one observation
-    :param names: of the policy's modules, by ``id``
-    """
-
-    observation_shape: tuple[int, ...]
-    names: Mapping[int, str] = field(default_factory=dict)
-    nodes: list[Node] = field(default_factory=list)
-    changed: set[int] = field(default_factory=set)
-    """Values that torch changes in place."""
-
-    def shape_of(self, value: int) -> tuple[int, ...]:
-        """Shape of a value so far."""
-        return self.nodes[value - 1].shape if value else self.observation_shape
-
-    def add(self, node: Node) -> int:
-        """Append an operation; the number of its result."""
-        self.nodes.append(node)
-        return len(self.nodes)
+class Tracer(GraphBuilder):
+    """Collects the operations of modules."""
 
     def walk(self, module: nn.Module, value: int | Mapping[str, int]) -> int:
-        """The result of a module applied to a value, or to a dict of values.
+        """Apply a module to a value, or to a dict of values, and return the result.
 
-        :raises UnsupportedError: if it does what cannot be exported
+        :raises UnsupportedError: if the module does what cannot be exported
         """
         module = unwrapped(module)
         if not isinstance(value, int):
-            return trace_forward(self, module, value)
+            return trace_forward(self, self.walk, module, value)
         if getattr(module, "inplace", False):
             self.changed.update(self.sources(value))
         elementwise = nodes_of(module)
@@ -105,17 +77,9 @@ class Tracer:
             return value
         if type(module).__module__.startswith("torch.nn.modules."):
             raise self.refusal(module)
-        return trace_forward(self, module, value)
-
-    def refusal(self, module: nn.Module, why: str = "", allowed: str = ALLOWED) -> UnsupportedError:
-        """The error for a module, which it names."""
-        kind, name = type(module).__name__, self.names.get(id(module), "")
-        called = f"{name} ({kind})" if name else kind
-        reason = f": {why}" if why else ""
-        return UnsupportedError(f"{called} cannot be exported{reason}; allowed are {allowed}")
+        return trace_forward(self, self.walk, module, value)
 
     def _flatten(self, module: nn.Flatten, value: int) -> int:
-        """All units of a value in one row."""
         shape = self.shape_of(value)
         axes = (module.start_dim, module.end_dim)
         if axes not in ((1, -1), (1, len(shape))):
@@ -123,44 +87,6 @@ class Tracer:
         if len(shape) == 1:
             return value
         return self.add(Flatten((value,), (int(np.prod(shape)),)))
-
-    def concat(self, values: list[int]) -> int:
-        """Values behind each other; those of a whole observation are the observation."""
-        shapes = [self.shape_of(value) for value in values]
-        if len(values) == 1:
-            return values[0]
-        start = 0
-        for value in values:
-            source = self.sources(value)[-1]
-            node = self.nodes[source - 1] if source else None
-            if not isinstance(node, Slice) or node.start != start:
-                start = -1
-                break
-            start += int(np.prod(node.shape))
-        if (start,) == self.observation_shape and all(len(shape) == 1 for shape in shapes):
-            return 0
-        units = sum(shape[0] for shape in shapes)
-        return self.add(Concat(tuple(values), (units, *shapes[0][1:])))
-
-    def finish(self) -> tuple[Node, ...]:
-        """All operations.
-
-        :raises UnsupportedError: if a value that was changed in place is used otherwise, too
-        """
-        for value in self.changed:
-            if sum(value in node.inputs for node in self.nodes) > 1:
-                raise UnsupportedError(
-                    "a network that changes a value in place (inplace=True, +=) and uses it "
-                    "elsewhere too cannot be exported; build it with inplace=False"
-                )
-        return tuple(self.nodes)
-
-    def sources(self, value: int) -> list[int]:
-        """A value, and what it is another view of."""
-        found = [value]
-        while found[-1] and isinstance(node := self.nodes[found[-1] - 1], Flatten):
-            found.append(node.inputs[0])
-        return found
 
     def _linear(self, module: nn.Linear, value: int) -> int:
         if len(self.shape_of(value)) != 1:
@@ -218,7 +144,7 @@ class Tracer:
         return self.add(Affine((value,), shape, scale, shift))
 
     def _norm(self, module: Any, mean: str, var: str, weight: str, value: int) -> int:
-        """Batch normalisation as it is in evaluation: by its running statistics."""
+        """Translate batch normalisation, which uses its running statistics in evaluation."""
         if getattr(module, mean) is None:
             raise self.refusal(module, "it keeps no statistics", "those that keep them")
         centre = _array(getattr(module, mean)).astype(np.float64)
@@ -229,7 +155,7 @@ class Tracer:
             and len(shape) == 1
             and (np.abs(centre) > FAR * deviation).any()
         ):
-            # Folded into the layer behind, such terms would cancel out and leave few digits.
+            # Folded into the next layer, such terms would cancel and leave few digits.
             value = self.add(Normalize((value,), shape, centre, 1.0 / deviation, np.inf))
             centre, deviation = np.zeros_like(centre), np.ones_like(deviation)
         scale = np.ones_like(deviation)
@@ -242,7 +168,7 @@ class Tracer:
 
 
 def _does(module: nn.Module, *kinds: type[Module]) -> TypeGuard[Module]:
-    """Whether a module is one of some kinds and computes what they do."""
+    """Tell whether a module is of one of these kinds and has not overridden its ``forward``."""
     forward = type(module).forward
     return isinstance(module, kinds) and forward in (
         *(kind.forward for kind in kinds),
@@ -251,7 +177,7 @@ def _does(module: nn.Module, *kinds: type[Module]) -> TypeGuard[Module]:
 
 
 def _arrays(module: nn.Linear | nn.Conv2d) -> tuple[Floats, Floats]:
-    """Dense weight and bias, whatever the storage."""
+    """Return dense weight and bias, whatever the storage."""
     weight = _array(module.state_dict().get("weight", module.weight))  # else parametrized
     bias = module.bias
     return weight, np.zeros(len(weight), np.float32) if bias is None else _array(bias)

@@ -1,10 +1,10 @@
-"""One call from a trained model to a policy that runs elsewhere."""
+"""The one call that exports a trained model."""
 
 from __future__ import annotations
 
 import tempfile
 from dataclasses import dataclass
-from importlib.metadata import version
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,14 +14,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
 from sb3_sparse.errors import ConfigError, MissingExtra, UnsupportedError
-from sb3_sparse.export.artifact import (
-    Artifact,
-    c_artifact,
-    dense_artifact,
-    numpy_artifact,
-    onnx_artifact,
-    predictor,
-)
+from sb3_sparse.export.artifact import GRAPH_ARTIFACTS, Artifact, dense_artifact, predictor
 from sb3_sparse.export.extract import check_model, graph_of, span_of
 from sb3_sparse.export.fold import fold
 from sb3_sparse.export.formats import check_format
@@ -49,29 +42,29 @@ RANDOM_IMAGES = 100
 class ExportReport:
     """What was written.
 
-    :param files: with their sizes in bytes
-    :param parity: how far it is from the model; None: not run
-    :param rounding: what 8-bit weights change in the actions; None: weights are float32
-    :param dense_bytes: float32 weights and biases of the dense network that acts; 0 for
+    :param files: the files and their sizes in bytes
+    :param parity: how closely the export acts as the model; None: not checked
+    :param rounding: how much 8-bit weights change the actions; None: weights are float32
+    :param sizes: bytes needed where the policy runs, by kind (``"flash"``, ``"RAM"``)
+    :param notes: what the user must know
+    :param nnz: connections of the acting network that are not 0; for ``"dense"``, of all networks
+    :param exported_nnz: those left once dead units are removed
+    :param dense_bytes: float32 weights and biases of the acting network if it were dense; 0 for
         ``"dense"``, as the counts of units
-    :param nnz: connections of the network that acts that are not 0; for ``"dense"``, of all
-    :param exported_nnz: those that are left without dead units
-    :param removed_units: dead units
-    :param units: units before
-    :param sizes: bytes that it takes where it runs, by kind (``"flash"``, ``"RAM"``)
-    :param notes: what its user must know
+    :param removed_units: number of dead units
+    :param units: number of units before
     """
 
     files: dict[Path, int]
     parity: Parity | None
     rounding: Parity | None
-    dense_bytes: int
-    nnz: int
-    exported_nnz: int
-    removed_units: int
-    units: int
     sizes: dict[str, int]
     notes: tuple[str, ...]
+    nnz: int
+    exported_nnz: int
+    dense_bytes: int = 0
+    removed_units: int = 0
+    units: int = 0
 
     def __str__(self) -> str:
         lines = [f"{path}: {size:,} bytes" for path, size in self.files.items()]
@@ -102,105 +95,103 @@ def export_policy(
 ) -> ExportReport:
     """Write a model's deterministic policy in another form, and check that it acts the same.
 
-    ``"c"``: one C99 file and its header; ``"numpy"``: an .npz and its loader; ``"onnx"``: an ONNX
-    model; these three hold everything from a raw observation to the action, normalisation and
-    rescaling too, and no dead units. ``"dense"``: a zip of stock SB3.
+    ``"c"`` writes a C99 file and its header, ``"numpy"`` an .npz file and its loader, ``"onnx"`` an
+    ONNX model. These three take a raw observation to an action, including normalisation and
+    rescaling, and leave out dead units. ``"dense"`` writes a zip of stock SB3.
 
-    :param model: of a supported algorithm, sparse or stock
-    :param path: of the file; its suffix may be left out
-    :param to: one of the four
+    :param model: a model of a supported algorithm, sparse or stock
+    :param path: the file to write; its suffix may be left out
+    :param to: ``"c"``, ``"numpy"``, ``"onnx"`` or ``"dense"``
     :param vecnormalize: what normalised the observations, or the file it was saved to; None: the
-        one in the model's own environment, if there is one
-    :param observations: recorded ones to check with, raw, of shape ``(count, *shape)`` as the
-        policy sees them (images channels first), or a dict of such; random ones are used besides
-    :param int8: C only: weights as 8-bit numbers with a scale for each row. Parity is then with
-        the rounded weights, and what rounding changes in the actions is reported
-    :param force: write also what fails the check
+        VecNormalize of the model's own environment, if there is one
+    :param observations: recorded observations for the check, raw, of shape ``(count, *shape)`` as
+        the policy sees them (images channels first), or a dict of such; random ones are always used
+    :param int8: for C only: store weights as 8-bit numbers with a scale for each row. The check
+        then compares with the rounded weights, and the report tells how rounding changes actions
+    :param force: write the files even if the check fails or cannot run
     :raises ConfigError: for a value that is not allowed
-    :raises UnsupportedError: for an algorithm, network or space that cannot be exported, or where
-        there is no C compiler to check with
-    :raises CorruptStateError: if weights are not finite
-    :raises ParityError: if it does not act as the model: continuous actions that differ by more
-        than 1e-5, relative to those above 1 and to the range that they are squashed into, or a
-        discrete action that differs
+    :raises UnsupportedError: for an algorithm, network or space that cannot be exported, or if
+        there is no C compiler for the check
+    :raises CorruptStateError: if weights and masks contradict each other
+    :raises Diverged: if weights are not finite
+    :raises ParityError: if the export does not act as the model: if continuous actions differ by
+        more than 1e-5, relative to their size above 1 and to the range they are squashed into, or
+        if any discrete action differs
+
+    Example::
+
+        from stable_baselines3 import PPO
+        from sb3_sparse.export import export_policy
+
+        model = PPO("SparsePolicy", "CartPole-v1", policy_kwargs=dict(sparsity=0.9))
+        print(export_policy(model, "policy", "numpy"))
     """
     check_format(to)
     if int8 and to != "c":
         raise ConfigError(f"int8 is for to='c' only, got to={to!r}")
     check_model(model)
-    normalization, left_out = normalization_of(model, vecnormalize), False
     space = model.observation_space
-    if normalization is not None and to == "dense":
-        left_out, normalization = True, None  # which happens outside of the zip, as before
-    elif normalization is not None:
-        check_statistics(space, normalization)
+    normalization = normalization_of(model, vecnormalize)
     if observations is not None:
         check_recorded(observations, space)
-    random = random_observations(
-        space, normalization, RANDOM_IMAGES if has_images(space) else RANDOM
-    )
-    made_by = version("sb3-sparse")
-    raw = small = Graph(())
     if to == "dense":
-        artifact = dense_artifact(model, left_out)
-        nnz = exported_nnz = _connections(model)
+        artifact = dense_artifact(model, normalization is not None)
+        normalization = exact = rounded = None  # a zip of SB3 does not normalise by itself
+        nnz = _connections(model)
+        counts = {"nnz": nnz, "exported_nnz": nnz}
     else:
+        if normalization is not None:
+            check_statistics(space, normalization)
         raw = graph_of(model, normalization)
-        small = remove_dead_units(fold(raw))
-        artifact = (
-            c_artifact(small, made_by, int8)
-            if to == "c"
-            else numpy_artifact(small)
-            if to == "numpy"
-            else onnx_artifact(small, made_by)
-        )
-        nnz, exported_nnz = raw.nnz, small.nnz
-    suffix = next(iter(artifact.files))
-    main = _main_file(Path(path), suffix)
-    discrete = not isinstance(model.action_space, spaces.Box)
-    notes = list(artifact.notes)
+        exact = remove_dead_units(fold(raw))
+        artifact = GRAPH_ARTIFACTS[to](exact, int8)
+        rounded = quantized(exact).run if int8 else None
+        counts = _counts(raw, exact)
+    path = _main_file(Path(path), next(iter(artifact.files)))
+    checked = partial(
+        compare,
+        recorded=observations,
+        random=random_observations(
+            space, normalization, RANDOM_IMAGES if has_images(space) else RANDOM
+        ),
+        discrete=not isinstance(model.action_space, spaces.Box),
+        span=span_of(model),
+    )
+    own, notes = predictor(model, normalization), list(artifact.notes)
     parity = rounding = None
-    own = predictor(model, normalization)
     try:
         actor = artifact.actor()
     except (UnsupportedError, MissingExtra) as error:
         if not force:
             raise
-        notes.append(f"written unchecked, as asked: {error}")
+        notes.append(f"written unchecked, as you asked: {error}")
     else:
-        reference = quantized(small).run if int8 else own
-        how = (observations, random, discrete, span_of(model))
-        parity = compare(reference, actor, *how)
-        if int8:
-            rounding = compare(own, actor, *how)
-        if not parity.holds:
-            failure = _failure(parity, small)
-            if not force:
-                raise ParityError(
-                    f"the export to {to!r} does not act as the model: {failure}. Nothing was "
-                    "written; --force (force=True) writes it all the same"
-                )
-            notes.append(f"written though it does not act as the model, as asked: {failure}")
+        parity = checked(rounded or own, actor)
+        rounding = checked(own, actor) if rounded else None
+    if parity is not None and not parity.holds:
+        failure = _failure(parity, exact)
+        if not force:
+            raise ParityError(
+                f"the export to {to!r} does not act as the model: {failure}. Nothing was written; "
+                "--force (force=True) writes it all the same"
+            )
+        notes.append(f"written although it does not act as the model, as you asked: {failure}")
     return ExportReport(
-        files=_write(artifact, main),
+        files=_write(artifact, path),
         parity=parity,
         rounding=rounding,
-        dense_bytes=sum(4 * (layer.weight.size + layer.bias.size) for layer in raw.layers),
-        nnz=nnz,
-        exported_nnz=exported_nnz,
-        removed_units=units_of(raw) - units_of(small),
-        units=units_of(raw),
         sizes=artifact.sizes,
         notes=tuple(notes),
+        **counts,
     )
 
 
 def normalization_of(
     model: BaseAlgorithm, given: VecNormalize | str | Path | None
 ) -> VecNormalize | None:
-    """What normalises a model's observations; None if nothing does.
+    """Return what normalises a model's observations; None if nothing does.
 
-    :raises ConfigError: if the file has no such thing, or the statistics are missing
+    :raises ConfigError: if the statistics are missing or invalid
     """
     if given is None:
         given = model.get_vec_normalize_env()
@@ -217,8 +208,19 @@ def normalization_of(
     return given if given is not None and given.norm_obs else None
 
 
+def _counts(raw: Graph, exact: Graph) -> dict[str, int]:
+    """Count what a graph had, and what it has without dead units."""
+    return {
+        "dense_bytes": sum(4 * (layer.weight.size + layer.bias.size) for layer in raw.layers),
+        "nnz": raw.nnz,
+        "exported_nnz": exact.nnz,
+        "removed_units": units_of(raw) - units_of(exact),
+        "units": units_of(raw),
+    }
+
+
 def _connections(model: BaseAlgorithm) -> int:
-    """Connections of all layers that are not 0, targets left out and shared layers once."""
+    """Count the connections that are not 0, without targets and with shared layers once."""
     layers = [
         module
         for name, module in unwrapped(model.policy).named_modules()
@@ -237,10 +239,10 @@ def _main_file(path: Path, suffix: str) -> Path:
     return path.with_suffix(suffix)
 
 
-def _failure(parity: Parity, graph: Graph) -> str:
-    """What is wrong, and by how little, where a tie is what is wrong."""
+def _failure(parity: Parity, graph: Graph | None) -> str:
+    """Describe the difference, and how close the scores are, since a tie may go either way."""
     text = f"{parity} (allowed: {'0' if parity.discrete else TOLERANCE})"
-    if not graph.nodes or not isinstance(graph.nodes[-1], Argmax):
+    if graph is None or not isinstance(graph.nodes[-1], Argmax):
         return text
     assert parity.worst is not None
     scores = graph.values(parity.worst)[-2][:, 0]
@@ -250,7 +252,7 @@ def _failure(parity: Parity, graph: Graph) -> str:
 
 
 def _write(artifact: Artifact, main: Path) -> dict[Path, int]:
-    """Write all files, or none."""
+    """Write all files, or none if one cannot be written; return their sizes."""
     main.parent.mkdir(parents=True, exist_ok=True)
     paths = {
         main.with_suffix(name) if name.startswith(".") else main.parent / name: content

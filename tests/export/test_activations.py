@@ -14,7 +14,7 @@ from torch import nn
 from sb3_sparse.errors import UnsupportedError
 from sb3_sparse.export import export_policy
 from sb3_sparse.export.activations import FORMULAS
-from sb3_sparse.export.artifact import c_artifact, numpy_artifact, onnx_artifact
+from sb3_sparse.export.artifact import GRAPH_ARTIFACTS
 from sb3_sparse.export.fold import fold
 from sb3_sparse.export.graph import Graph
 from sb3_sparse.export.nodes import Standardize
@@ -71,7 +71,7 @@ def test_each_format_computes_what_torch_does(name, image):
     value = tracer.walk(nn.Flatten(), tracer.walk(module, 0))
     tracer.walk(nn.Hardtanh(-3e38, 3e38), value)  # as a Box does
     graph = fold(Graph(x.shape[1:], tracer.finish(), (UNITS,)))
-    written = [c_artifact(graph, "1", False), numpy_artifact(graph), onnx_artifact(graph, "1")]
+    written = [make(graph, False) for make in GRAPH_ARTIFACTS.values()]
     for act in (graph.run, *(artifact.actor() for artifact in written)):
         with warnings.catch_warnings():
             warnings.simplefilter("error")
