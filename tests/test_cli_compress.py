@@ -128,6 +128,6 @@ def test_an_interrupted_compression_goes_on(run):
     assert running.returncode == 130, said
     assert "Interrupted. Finished levels are kept; give the same command to resume." in said
     said = sb3_sparse(*args)
-    assert "Going on after level" in said
+    assert "Resuming after level" in said
     assert "Level 1:" not in said
     assert "Level 3:" in said

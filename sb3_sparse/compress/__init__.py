@@ -1,4 +1,4 @@
-"""Trained models made sparse: their twins, and the search for how sparse they can be."""
+"""Makes trained models sparse, and finds how sparse they can be."""
 
 from __future__ import annotations
 

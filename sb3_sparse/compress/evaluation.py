@@ -1,4 +1,4 @@
-"""Episodes that can be paired: the same number, the same seed."""
+"""Plays episodes that can be paired: equal numbers mean equal seeds."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from sb3_sparse.errors import ConfigError
 
 
 def check_eval_env(env: VecEnv) -> None:
-    """Refuse environments whose returns would not be the model's.
+    """Reject environments whose returns would not be the model's.
 
-    :raises ConfigError: if their normalisation learns or scales rewards, or if several would not
-        really start anew when they are reset
+    :raises ConfigError: if their normalisation learns or scales rewards, or if there are several
+        and a reset would not start a new game
     """
     normalize = unwrap_vec_normalize(env)
     if normalize is not None and (normalize.training or normalize.norm_reward):
@@ -36,12 +36,13 @@ def check_eval_env(env: VecEnv) -> None:
 def episode_returns(
     model: BaseAlgorithm, env: VecEnv, episodes: int, seed: int, deterministic: bool
 ) -> list[float]:
-    """Undiscounted returns of episodes, as many in each environment, so that none is favoured.
+    """Play episodes and return their undiscounted returns.
 
-    As in SB3, those of a Monitor count where there is one. torch's generator is left where it was.
+    Each environment plays equally many, so that short episodes are not favoured. As in SB3, a
+    Monitor's returns count if there is one. The state of torch's generator does not change.
 
-    :param episodes: at least so many; rounded up to a multiple of the number of environments
-    :param seed: of the environments, and of actions that are drawn
+    :param episodes: number of episodes, rounded up to a multiple of the number of environments
+    :param seed: seed of the environments and of sampled actions
     :param deterministic: whether the policy acts deterministically
     """
     rounds = math.ceil(episodes / env.num_envs)
@@ -61,7 +62,7 @@ def episode_returns(
             for index in np.flatnonzero(dones):
                 episode = infos[index].get("episode") if monitored else None
                 if monitored and episode is None:
-                    continue  # a life was lost, and the game goes on
+                    continue  # a life was lost, but the game continues
                 if played[index] < rounds:
                     total = running[index] if episode is None else episode["r"]
                     returns[played[index], index] = total

@@ -1,4 +1,4 @@
-"""Training on, where plain ``learn`` would spoil a trained model."""
+"""Fine-tunes a trained model, which plain ``learn`` would spoil."""
 
 from __future__ import annotations
 
@@ -14,21 +14,22 @@ from stable_baselines3.common.utils import ConstantSchedule
 from sb3_sparse.loading.zips import check_finite
 
 EXPERIENCE = 10_000
-"""Environment steps that a replay buffer shall hold before it is learnt from."""
+"""Environment steps that a replay buffer must hold before the model learns from it."""
 HALF_WAY = 0.5
-"""Progress remaining at which schedules are read."""
+"""Progress remaining at which schedules are evaluated."""
 
 
 class Annealed:
-    """A learning rate that falls in a line, from what its schedule has half-way through training.
+    """A learning rate that falls linearly to 0 from its schedule's value half-way through training.
 
-    ``learn`` on top of a finished training would find the last few percent of a schedule, where a
-    linear one is all but 0; and one that stays high leaves the policy wherever the last minibatch
-    took it. To start from an earlier rate: learning rate rewinding, arXiv:2003.02389.
+    After a finished training, ``learn`` would use the last few percent of a schedule, where a
+    linear one is nearly 0. A rate that stays high would leave the policy wherever the last
+    minibatch took it. Source for starting from an earlier rate: learning rate rewinding,
+    arXiv:2003.02389.
 
-    :param schedule: a function of the progress that remains, 1 at the start and 0 at the end
-    :param start: progress remaining, as SB3 counts it, when the fine-tuning begins; above 0
-    :param lag: progress of one rollout where SB3 asks only after it, so that the last is not lost
+    :param schedule: a function of the remaining progress, 1 at the start and 0 at the end
+    :param start: remaining progress, as SB3 counts it, when fine-tuning begins; above 0
+    :param lag: progress of one rollout if SB3 asks after each rollout, so that the last one learns
     """
 
     def __init__(self, schedule: Callable[[float], float], start: float, lag: float) -> None:
@@ -42,10 +43,10 @@ class Annealed:
 
 
 def fine_tune(model: BaseAlgorithm, steps: int) -> None:
-    """Train on with masks as they are.
+    """Continue training with fixed masks.
 
-    The learning rate falls to 0, PPO's clip ranges are those half-way through training, and the
-    exploration of DQN stays at its end.
+    The learning rate falls to 0, PPO's clip ranges have their values half-way through training, and
+    DQN's exploration has its final value.
 
     :param model: a sparse model with an environment
     :param steps: environment steps
@@ -62,14 +63,14 @@ def fine_tune(model: BaseAlgorithm, steps: int) -> None:
     with _changed(model, **changes, **_settled(model)):
         try:
             model.learn(steps, reset_num_timesteps=False)
-        finally:  # a distribution of NaN raises an error of torch's, which says less
+        finally:  # torch's own error about NaN in a distribution says less
             check_finite(model.policy.state_dict(), "the model that is fine-tuned")
 
 
 def fill_buffer(model: BaseAlgorithm) -> int:
-    """Let a model act without learning until its replay buffer can be learnt from; steps taken.
+    """Let a model act without learning until its replay buffer is full enough; return the steps.
 
-    A model that was loaded has an empty buffer, and would soon overfit to its first few steps.
+    A loaded model has an empty buffer, and would overfit to its first few steps.
     """
     if not isinstance(model, OffPolicyAlgorithm):
         return 0
@@ -86,7 +87,7 @@ def fill_buffer(model: BaseAlgorithm) -> int:
 
 
 def _settled(model: BaseAlgorithm) -> dict[str, Any]:
-    """Attributes of a model that explores no more than at the end of its training."""
+    """Return the attributes of a model that explores as at the end of its training."""
     settled: dict[str, Any] = {}
     if hasattr(model, "learning_starts"):
         settled["learning_starts"] = 0
@@ -98,7 +99,7 @@ def _settled(model: BaseAlgorithm) -> dict[str, Any]:
 
 @contextmanager
 def _changed(model: BaseAlgorithm, **attributes: Any) -> Iterator[None]:
-    """Within it, the model has other attributes."""
+    """Change attributes of a model for the duration of a block."""
     before = {name: getattr(model, name) for name in attributes}
     vars(model).update(attributes)
     try:

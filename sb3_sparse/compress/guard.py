@@ -1,4 +1,4 @@
-"""The statistics of the guard: what returns show about a drop."""
+"""Decides from returns whether they have dropped too far."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Interval:
         return f"{self.mean:.2f} [{self.low:.2f}, {self.high:.2f}]"
 
     def share_of(self, whole: float) -> str:
-        """The interval as signed percentages of ``|whole|``."""
+        """Return the interval as signed percentages of ``|whole|``."""
         if whole == 0.0:
             return "of a return of 0"
         mean, low, high = (100 * value / abs(whole) for value in (self.mean, self.low, self.high))
@@ -37,7 +37,7 @@ class Interval:
 
 
 def mean_interval(values: Sequence[float]) -> Interval:
-    """Student's t interval of a mean; of identical values, the value itself.
+    """Return Student's t interval of a mean; for identical values, the value itself.
 
     :param values: two or more
     """
@@ -46,21 +46,21 @@ def mean_interval(values: Sequence[float]) -> Interval:
 
 
 def change(sparse: Sequence[float], baseline: Sequence[float]) -> Interval:
-    """By how much the mean return has changed, from pairs of episodes.
+    """Estimate how much the mean return has changed, from pairs of episodes.
 
-    Episodes of the same number begin with the same seed, so much of their luck is the same; the
-    interval of the paired differences is then narrower than Welch's of two independent samples. If
-    nothing is shared, it costs degrees of freedom only.
+    Episodes of a pair start from the same seed and so share much of their luck. The interval of
+    the paired differences is then narrower than Welch's of two independent samples; if nothing is
+    shared, it only costs degrees of freedom.
 
     :param sparse: returns of the sparse model
-    :param baseline: returns of the model that it is compared with, in the same order
+    :param baseline: returns of the original model, in the same order
     """
     assert len(sparse) == len(baseline)
     return mean_interval(np.subtract(sparse, baseline).tolist())
 
 
 def judge(change: Interval, tolerance: float) -> Literal["passed", "failed", "undecided"]:
-    """Whether a drop is shown to be tolerable (passed), shown not to be (failed), or neither.
+    """Tell whether a drop is tolerable (passed), intolerable (failed), or could be either.
 
     :param change: change of the mean return
     :param tolerance: largest drop allowed, in units of the return, 0 or more
@@ -71,11 +71,11 @@ def judge(change: Interval, tolerance: float) -> Literal["passed", "failed", "un
 
 
 def tolerance(baseline: Sequence[float], max_drop: float) -> float:
-    """The largest drop allowed, in units of the return.
+    """Return the largest drop allowed, in units of the return.
 
-    :param baseline: returns of the model to be compressed
+    :param baseline: returns of the original model
     :param max_drop: share of the absolute mean return
-    :raises ConfigError: if the mean cannot be told from 0, of which a share means nothing
+    :raises ConfigError: if the mean cannot be told from 0, so that a share of it means nothing
     """
     interval = mean_interval(baseline)
     if interval.low <= 0.0 <= interval.high:

@@ -1,4 +1,4 @@
-"""Models, environments and files that a search works with."""
+"""The models, environments and files of a search."""
 
 from __future__ import annotations
 
@@ -25,22 +25,22 @@ from sb3_sparse.policies.internals import LAST_SEEN
 LEVELS = "levels"
 VECNORMALIZE = "vecnormalize.pkl"
 SEEDS_PER_BATCH = 1000
-"""More than there are environments, each of which gets a seed of its own."""
+"""More than there are environments, each of which has its own seed."""
 NORMALIZATION = ("obs_rms", "ret_rms")
 
 
 class ModelPruner:
-    """Prunes, trains and evaluates for a search.
+    """Prunes, fine-tunes and evaluates a model for a search.
 
-    :param model: the model to be compressed, with an environment; it is not changed, but its
-        environment and replay buffer are used
-    :param eval_env: environments of the evaluation
+    :param model: the original model, with an environment; it is not changed, but its environment
+        and replay buffer are used
+    :param eval_env: environments for evaluation
     :param folder: where accepted models are kept
     :param steps: environment steps of a fine-tuning
-    :param episodes: of a batch
-    :param seed: of all
+    :param episodes: episodes of a batch
+    :param seed: seed of training and evaluation
     :param deterministic: whether policies are evaluated deterministically
-    :param distribution: how sparsity is shared out; None: as the model has it
+    :param distribution: how sparsity is shared out among layers; None: as the model has it
     """
 
     def __init__(
@@ -67,30 +67,30 @@ class ModelPruner:
         self.candidate = self.accepted
         self._played_last = model
         self._before = self._statistics()
-        """Normalisation of the model to be compressed."""
+        """Normalisation of the original model."""
         self._kept = self._before
-        """The same of the accepted model."""
+        """Normalisation of the accepted model."""
 
     @property
     def nnz(self) -> int:
-        """Connections of the accepted model's acting network."""
+        """Number of connections of the accepted model's acting network."""
         return self._acting(self.accepted).nnz
 
     @property
     def floor(self) -> float:
-        """Density at which every layer has one connection."""
+        """Density at which every layer of the acting network has one connection."""
         network = self._acting(self.accepted)
         return len(network.layers) / network.size
 
     def restore(self, number: int) -> None:
-        """Go on from the accepted model of a level.
+        """Make the model of a level the accepted one.
 
-        :raises CorruptStateError: if its file is gone
+        :raises CorruptStateError: if its file is missing
         """
         path = self._path(number)
         if not path.is_file():
-            raise CorruptStateError(f"{path} is missing; remove {self.folder} and begin anew")
-        with reading(path, "level of a compression", f"remove {self.folder} and begin anew"):
+            raise CorruptStateError(f"{path} is missing; remove {self.folder} and start again")
+        with reading(path, "level of a compression", f"remove {self.folder} and start again"):
             self.candidate = self.accepted = load_beside(self.model, path)
         normalize = self.model.get_vec_normalize_env()
         if normalize is not None:
@@ -98,10 +98,10 @@ class ModelPruner:
             self._kept = _statistics_of(saved)
 
     def make(self, number: int, sparsity: float) -> int:
-        """Prune the last accepted model and fine-tune it; connections of its acting network."""
+        """Prune and fine-tune the accepted model; return the nnz of the acting network."""
         self._set_statistics(self.model.env, self._kept)
         if isinstance(self.accepted, OffPolicyAlgorithm):
-            # The environment goes on where the last model left it, as the replay buffer expects.
+            # The environment continues where the last model left it, as the buffer expects.
             for name in LAST_SEEN:
                 setattr(self.accepted, name, copy.deepcopy(getattr(self._played_last, name)))
             self.accepted.set_random_seed(self.seed)
@@ -109,13 +109,13 @@ class ModelPruner:
         model = sparsify(self.accepted, {**self.sparsities, self.network: sparsity})
         model.set_random_seed(self.seed + number)
         if isinstance(model, OnPolicyAlgorithm):
-            model._last_obs = None  # a level begins alike, whatever was before
+            model._last_obs = None  # so that a level starts the same, whatever came before
         self._played_last = self.candidate = model
         fine_tune(model, self.steps)
         return self._acting(model).nnz
 
     def returns(self, baseline: bool, batch: int) -> list[float]:
-        """Returns of a numbered batch of episodes, of the baseline or the candidate."""
+        """Return the returns of a numbered batch of episodes, of the baseline or the candidate."""
         statistics = self._before if baseline else self._statistics()
         self._set_statistics(self.eval_env, statistics)
         return episode_returns(
@@ -127,28 +127,28 @@ class ModelPruner:
         )
 
     def accept(self, number: int) -> None:
-        """Keep the candidate, and put it on the disk."""
+        """Accept the candidate, and save it to disk."""
         self.accepted, self._kept = self.candidate, self._statistics()
         path = self._path(number)
         path.parent.mkdir(exist_ok=True)
         self._save(path, path.with_suffix(".pkl"))
 
     def back_to_accepted(self) -> None:
-        """Make the accepted model the candidate again, with its normalisation."""
+        """Make the accepted model the candidate again, and restore its normalisation."""
         self.candidate = self.accepted
         self._set_statistics(self.model.env, self._kept)
 
     def forget_levels(self, kept: int) -> None:
-        """Remove the files of every level but one.
+        """Remove the files of all levels but one.
 
-        :param kept: its number; 0: none
+        :param kept: number of the level to keep; 0: keep none
         """
         for path in (self.folder / LEVELS).glob("*"):
             if path.stem != str(kept):
                 path.unlink()
 
     def finish(self, name: str) -> Path:
-        """Write the accepted model as rl-zoo lays out a run; its file."""
+        """Write the accepted model in the layout of an rl-zoo run; return its file."""
         self.back_to_accepted()
         (self.folder / name).mkdir(exist_ok=True)
         path = self.folder / f"{name}.zip"
@@ -156,7 +156,7 @@ class ModelPruner:
         return path
 
     def clear(self) -> None:
-        """Remove what only an interrupted search needs."""
+        """Remove the files that only an interrupted search needs."""
         shutil.rmtree(self.folder / LEVELS, ignore_errors=True)
 
     def _save(self, path: Path, normalization: Path) -> None:
@@ -175,9 +175,7 @@ class ModelPruner:
 
     def _statistics(self) -> dict[str, Any]:
         normalize = self.model.get_vec_normalize_env()
-        if normalize is None:
-            return {}
-        return _statistics_of(normalize)
+        return {} if normalize is None else _statistics_of(normalize)
 
     @staticmethod
     def _set_statistics(env: VecEnv | None, statistics: dict[str, Any]) -> None:
@@ -187,7 +185,7 @@ class ModelPruner:
 
 
 def _statistics_of(normalize: VecNormalize) -> dict[str, Any]:
-    """A copy of what a VecNormalize has seen; without norm_obs it has no obs_rms."""
+    """Copy the statistics of a VecNormalize, which has no obs_rms without norm_obs."""
     return {
         name: copy.deepcopy(found)
         for name, found in vars(normalize).items()

@@ -1,4 +1,4 @@
-"""``compress.json``: what a compression was asked for and how far it is."""
+"""``compress.json``: the settings and the progress of a compression."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ FORMAT = 1
 
 @dataclass
 class CompressionRecord:
-    """All that an interrupted compression goes on from, beside the accepted model.
+    """All that an interrupted compression resumes from, beside the accepted model.
 
     :param settings: what decides about the outcome, in plain JSON types
-    :param baseline: returns of the model to be compressed, by batch
-    :param levels: done so far
-    :param checked: returns of the outcome and of the baseline, of episodes that decided nothing
+    :param baseline: returns of the original model, by batch
+    :param levels: finished levels
+    :param checked: returns of the outcome and of the baseline on fresh episodes
     :param finished: whether the outcome is written
     """
 
@@ -42,7 +42,7 @@ class CompressionRecord:
 
     @property
     def accepted(self) -> int:
-        """Number of the last level whose model was accepted, from 1; 0: none was."""
+        """Number of the last accepted level, from 1; 0: there is none."""
         return max((n for n, level in enumerate(self.levels, 1) if level.accepted), default=0)
 
     def save(self, folder: Path) -> None:
@@ -52,15 +52,15 @@ class CompressionRecord:
 
 
 def open_record(folder: Path, settings: dict[str, Any]) -> CompressionRecord:
-    """The record in a folder, or a new one.
+    """Read the record in a folder, or make a new one.
 
-    :raises ConfigError: if the folder's compression is of other settings
+    :raises ConfigError: if the folder holds a compression with other settings
     :raises CorruptStateError: if its file is damaged
     """
     path = folder / NAME
     if not path.is_file():
         return CompressionRecord(settings)
-    cure = "remove the folder and begin anew"
+    cure = "remove the folder and start again"
     content = read_json(path, "record of a compression", cure)
     with reading(path, "record of a compression", cure):
         record = CompressionRecord(
@@ -71,7 +71,7 @@ def open_record(folder: Path, settings: dict[str, Any]) -> CompressionRecord:
             finished=content["finished"],
         )
         if not isinstance(record.settings, dict):
-            raise CorruptStateError(f"{path} is damaged: settings are no mapping; {cure}")
+            raise CorruptStateError(f"{path} is damaged: settings are not a mapping; {cure}")
     others = {
         name: (record.settings.get(name), settings.get(name))
         for name in {**record.settings, **settings}
@@ -84,8 +84,8 @@ def open_record(folder: Path, settings: dict[str, Any]) -> CompressionRecord:
             f"{name} {old!r} instead of {new!r}" for name, (old, new) in others.items()
         )
         raise ConfigError(
-            f"{folder} holds a compression with {told}. Give the same settings to go on with it, "
-            "or another folder"
+            f"{folder} holds a compression with {told}. Give the same settings to resume it, or "
+            "another folder"
         )
     return record
 
@@ -101,7 +101,7 @@ def _level(content: Mapping[str, Any]) -> Level:
 
 
 def fingerprint(model: BaseAlgorithm) -> str:
-    """A hash of a model's policy and step count."""
+    """Return a hash of a model's policy and step count."""
     digest = hashlib.sha256(f"{type(model).__name__} {model.num_timesteps}".encode())
     for name, tensor in sorted(unwrapped(model.policy).state_dict().items()):
         digest.update(name.encode())

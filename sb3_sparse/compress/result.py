@@ -1,4 +1,4 @@
-"""What a compression came to."""
+"""The outcome of a compression."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from sb3_sparse.compress.search import Level
 
 @dataclass(frozen=True)
 class Compression:
-    """The outcome. Its returns are of episodes that had no part in choosing it.
+    """The outcome of a compression; its returns are from episodes that had no part in choosing it.
 
-    :param path: the model
-    :param network: the network that acts, which was pruned
-    :param sparsity: of every network
-    :param nnz_before: active connections of the acting network, before
-    :param nnz: the same now
-    :param baseline: return of the model that was compressed
-    :param outcome: return of the compressed one
-    :param change: of the return, from pairs of episodes
-    :param episodes: how many each played
-    :param levels: what was tried
+    :param path: file of the compressed model
+    :param network: name of the acting network, which was pruned
+    :param sparsity: sparsity of every network
+    :param nnz_before: active connections of the acting network before
+    :param nnz: active connections of the acting network now
+    :param baseline: return of the original model
+    :param outcome: return of the compressed model
+    :param change: change of the return, from pairs of episodes
+    :param episodes: number of episodes that each model played
+    :param levels: the sparsities that were tried
     """
 
     path: Path

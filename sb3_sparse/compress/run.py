@@ -1,9 +1,9 @@
-"""A compression from a model to a folder."""
+"""Compresses a model into a folder."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ from sb3_sparse.sparsity.distributions import check_distribution, check_sparsity
 MAX_DROP = 0.03
 BATCHES = 8
 FRESH = 1000
-"""Batches from this number on decide nothing."""
+"""Batches from this number on have no part in any decision."""
 
 
 def compress_model(
@@ -41,44 +41,54 @@ def compress_model(
     name: str = "model",
     say: Callable[[str], None] = lambda line: None,
 ) -> Compression:
-    """Make a trained model as sparse as its return allows, or as sparse as asked for.
+    """Make a trained model as sparse as its return allows, or as sparse as you ask for.
 
-    Pruned is the network that acts: the actor, or the Q network. A critic keeps what it has, since
-    nobody deploys it and fine-tuning needs it. Level by level 40 % of the remaining connections go,
-    those of least magnitude, and the model is fine-tuned with what is left.
+    Only the network that acts is pruned: the actor or the Q network. A critic stays as it is, since
+    it is not deployed and fine-tuning needs it. Each level removes the 40 % of the remaining
+    connections that have the smallest magnitude, and fine-tunes the rest.
 
     With ``max_drop``, a level passes when the 95 % confidence interval of the change in mean return
-    lies above ``-max_drop * |mean return|`` and fails when it lies below. As long as it is
-    undecided, another batch of episodes is played, up to 8; then it has failed. After the first
-    failure the gap is halved twice. Looking several times at one level, and choosing among levels,
-    makes false passes somewhat likelier than the 2.5 % of a single look; the returns of the outcome
-    are therefore measured once more, on fresh episodes.
+    lies above ``-max_drop * |mean return|``, and fails when it lies below. While neither holds,
+    another batch of episodes is played, up to 8; then the level has failed. After the first failure
+    the gap is halved twice. Looking several times at one level, and choosing among levels, makes
+    false passes somewhat likelier than the 2.5 % of a single look, so the returns of the outcome
+    are measured again on fresh episodes.
 
-    Everything is kept in ``folder``: the same call goes on with an interrupted compression at the
-    first level that is not done, and returns the outcome of a finished one. Given the same seed, an
-    on-policy model comes out the same whether it was interrupted or not; an off-policy one may
-    not, since its replay buffer is filled anew.
+    Everything is kept in ``folder``. The same call resumes an interrupted compression at the first
+    unfinished level, and returns the outcome of a finished one. With equal seeds, an on-policy
+    model comes out the same whether it was interrupted or not; an off-policy one may not, since its
+    replay buffer is filled anew.
 
-    :param model: with an environment to fine-tune in; stock or sparse; left as it is, but for its
-        environment and replay buffer, which are used. Load it with ``verbose=0`` for quiet
-    :param eval_env: environments of the evaluation, with the model's normalisation if it has one
-    :param folder: is made; holds ``<name>.zip`` in the end, ``<name>/vecnormalize.pkl`` too if
-        there is normalisation, and ``compress.json``
+    :param model: a stock or sparse model with an environment to fine-tune in. It is not changed,
+        but its environment and replay buffer are used. Load it with ``verbose=0`` to keep it quiet
+    :param eval_env: environments for evaluation, with the model's normalisation if it has one
+    :param folder: created if needed; receives ``<name>.zip``, ``<name>/vecnormalize.pkl`` if there
+        is normalisation, and ``compress.json``
     :param max_drop: largest drop of the mean return, as a share of it, in [0, 1) (0.03)
-    :param sparsity: of the acting network, instead: ends at it, with no guard
+    :param sparsity: sparsity of the acting network to end at, instead of ``max_drop``
     :param steps: environment steps of each fine-tuning; None: 5 % of the model's, 10,000 or more
-    :param episodes: of a batch, 2 or more
-    :param seed: of training and evaluation
+    :param episodes: episodes of a batch, 2 or more
+    :param seed: seed of training and evaluation
     :param deterministic: whether policies are evaluated deterministically
     :param distribution: ``"erk"``, ``"er"`` or ``"uniform"``; None: a sparse model's own, or erk
-    :param name: of the final files
-    :param say: is told what happens, line by line
-    :raises ConfigError: for a value that is not allowed, a model without environment, a return that
-        no share can be taken of, or a folder with a compression of other settings
+    :param name: name of the final files
+    :param say: called with each line of progress
+    :raises ConfigError: for a value that is not allowed, a model without environment, a return too
+        close to 0 to take a share of, or a folder that holds a compression with other settings
     :raises UnsupportedError: as :func:`~sb3_sparse.compress.twin.sparsify`
     :raises CorruptStateError: if the folder is damaged
 
     Source: iterative magnitude pruning, arXiv:1506.02626, section 3.
+
+    Example::
+
+        from stable_baselines3 import PPO
+        from stable_baselines3.common.env_util import make_vec_env
+        from sb3_sparse.compress import compress_model
+
+        model = PPO("MlpPolicy", "CartPole-v1", n_steps=64).learn(64)
+        envs = make_vec_env("CartPole-v1")
+        print(compress_model(model, envs, "smaller", sparsity=0.5, steps=64, episodes=2))
     """
     settings = _settings(model, eval_env, max_drop, sparsity, steps, episodes, seed)
     settings |= {"deterministic": deterministic, "distribution": distribution, "name": name}
@@ -90,43 +100,38 @@ def compress_model(
     pruner = ModelPruner(
         model, eval_env, folder, settings["steps"], episodes, seed, deterministic, distribution
     )
-    before = pruner.nnz
-    rules = Rules(
-        start=pruner.sparsities[pruner.network],
-        floor=pruner.floor,
-        max_drop=settings["max_drop"],
-        goal=settings["sparsity"],
-        batches=BATCHES if settings["max_drop"] is not None else 1,
-    )
+    nnz_before, rules = pruner.nnz, _rules(pruner, settings)
     path = folder / f"{name}.zip"
-    if rules.goal is not None and rules.goal <= rules.start:
-        raise ConfigError(
-            f"sparsity={rules.goal} is not above the {rules.start} that the {pruner.network} has "
-            "already; give more"
-        )
-    if rules.goal is not None and 1.0 - rules.goal < rules.floor:
-        raise ConfigError(
-            f"sparsity={rules.goal} leaves less than one connection a layer of the "
-            f"{pruner.network}; allowed is up to {math.floor(1e4 * (1.0 - rules.floor)) / 1e4}"
-        )
-    if record.finished and not path.is_file():
+    if not record.finished:
+        _finish(record, pruner, rules, name, say)
+    elif path.is_file():
+        say(f"The compression in {folder} is finished")
+    else:
         raise CorruptStateError(
             f"the compression in {folder} is finished, but {path} is missing; remove the folder "
-            "and begin anew"
+            "and start again"
         )
-    if record.finished:
-        say(f"The compression in {folder} is finished")
-        pruner.clear()
-        return _outcome(record, pruner, path, before)
-    if record.levels:
-        say(f"Going on after level {len(record.levels)}")
-    if record.accepted:
-        pruner.restore(record.accepted)
+    pruner.clear()
+    return _outcome(record, pruner, path, nnz_before)
+
+
+def _finish(
+    record: CompressionRecord,
+    pruner: ModelPruner,
+    rules: Rules,
+    name: str,
+    say: Callable[[str], None],
+) -> None:
+    """Do what a compression still lacks, and write the final files."""
 
     def save() -> None:
-        record.save(folder)
+        record.save(pruner.folder)
         pruner.forget_levels(record.accepted)
 
+    if record.levels:
+        say(f"Resuming after level {len(record.levels)}")
+    if record.accepted:
+        pruner.restore(record.accepted)
     search(rules, pruner, record.baseline, record.levels, save, say)
     pruner.back_to_accepted()
     if record.checked is None:
@@ -135,8 +140,31 @@ def compress_model(
     pruner.finish(name)
     record.finished = True
     save()
-    pruner.clear()
-    return _outcome(record, pruner, path, before)
+
+
+def _rules(pruner: ModelPruner, settings: Mapping[str, Any]) -> Rules:
+    """Return the rules of a search.
+
+    :raises ConfigError: if the model cannot be pruned to the sparsity asked for
+    """
+    rules = Rules(
+        start=pruner.sparsities[pruner.network],
+        floor=pruner.floor,
+        max_drop=settings["max_drop"],
+        goal=settings["sparsity"],
+        batches=1 if settings["max_drop"] is None else BATCHES,
+    )
+    if rules.goal is not None and rules.goal <= rules.start:
+        raise ConfigError(
+            f"sparsity={rules.goal} is not above the {rules.start} that the {pruner.network} has "
+            "already; give more"
+        )
+    if rules.goal is not None and 1.0 - rules.goal < rules.floor:
+        raise ConfigError(
+            f"sparsity={rules.goal} leaves less than one connection per layer of the "
+            f"{pruner.network}; allowed is up to {math.floor(1e4 * (1.0 - rules.floor)) / 1e4}"
+        )
+    return rules
 
 
 def _settings(
@@ -148,8 +176,8 @@ def _settings(
     episodes: int,
     seed: int,
 ) -> dict[str, Any]:
-    """What decides about the outcome, checked."""
-    sparsity_of(model)  # is refused if there is no sparse counterpart
+    """Check the arguments that decide about the outcome, and return them."""
+    sparsity_of(model)  # raises if the model has no sparse counterpart
     if model.env is None:
         raise ConfigError(
             "the model has no environment to be fine-tuned in; load it with one, or call set_env"
@@ -196,7 +224,7 @@ def _settings(
 
 
 def _check(record: CompressionRecord, pruner: ModelPruner) -> tuple[list[float], list[float]]:
-    """Returns of outcome and baseline on fresh episodes, as many as it was accepted by."""
+    """Return outcome and baseline returns of fresh episodes, as many as accepted the outcome."""
     accepted = record.levels[record.accepted - 1] if record.accepted else None
     wanted = len(accepted.returns) if accepted else pruner.episodes
     outcome: list[float] = []

@@ -1,6 +1,7 @@
-"""Which sparsity to try next, and the search that goes by it.
+"""Searches for the sparsity that a model's return allows.
 
-Only the levels that are done decide, so an interrupted search goes on as if nothing had happened.
+Each step depends on the finished levels alone, so an interrupted search resumes as if nothing had
+happened.
 """
 
 from __future__ import annotations
@@ -22,12 +23,12 @@ DIGITS = 6
 class Level:
     """One sparsity that was tried.
 
-    :param sparsity: of the acting network
-    :param nnz: its active connections
+    :param sparsity: sparsity of the acting network
+    :param nnz: active connections of the acting network
     :param verdict: ``"passed"``, ``"failed"``, ``"undecided"`` (which counts as failed), or
-        ``"done"`` of a search without a guard
+        ``"done"`` in a search without a guard
     :param returns: episode returns, paired with the baseline's
-    :param change: of the mean return, against the baseline
+    :param change: change of the mean return against the baseline
     """
 
     sparsity: float
@@ -38,7 +39,7 @@ class Level:
 
     @property
     def accepted(self) -> bool:
-        """Whether the search goes on from its model."""
+        """Whether the search continues from its model."""
         return self.verdict in ("passed", "done")
 
     def __str__(self) -> str:
@@ -53,15 +54,16 @@ class Level:
 def next_sparsity(
     levels: Sequence[Level], start: float, goal: float | None, floor: float
 ) -> float | None:
-    """The sparsity to try after these levels; None: the search is over.
+    """Return the sparsity to try after these levels; None: the search is over.
 
-    Densities shrink by 0.6 a level, until ``goal`` is reached or a level is not accepted; then the
-    gap between the last that was and the first that was not is halved twice, in the logarithm.
+    Each level multiplies the density by 0.6, until ``goal`` is reached or a level is not accepted.
+    Then the gap between the last accepted density and the first that was not is halved twice, on a
+    logarithmic scale.
 
-    :param levels: done so far, in order
-    :param start: sparsity that the model has
+    :param levels: finished levels, in order
+    :param start: sparsity of the original model
     :param goal: sparsity to end at; None: as high as levels are accepted
-    :param floor: density below which no layer can lose anything more
+    :param floor: density below which no layer can lose more connections
     """
     passed = min([1.0 - start, *(1.0 - level.sparsity for level in levels if level.accepted)])
     failed = [1.0 - level.sparsity for level in levels if not level.accepted]
@@ -82,27 +84,27 @@ def _sparsity(density: float) -> float:
 
 
 class Pruner(Protocol):
-    """What a search needs done."""
+    """Prunes, fine-tunes and evaluates for a search."""
 
     def make(self, number: int, sparsity: float) -> int:
-        """Prune the last accepted model and fine-tune it, as the candidate; its connections."""
+        """Make the candidate: prune and fine-tune the last accepted model; return its nnz."""
 
     def returns(self, baseline: bool, batch: int) -> list[float]:
-        """Returns of a numbered batch of episodes, of the baseline or the candidate."""
+        """Return the returns of a numbered batch of episodes, of the baseline or the candidate."""
 
     def accept(self, number: int) -> None:
-        """Keep the candidate, on the disk too."""
+        """Accept the candidate, and save it to disk."""
 
 
 @dataclass(frozen=True)
 class Rules:
-    """What a search goes by.
+    """The rules of a search.
 
-    :param start: sparsity that the model has
-    :param floor: density below which nothing more can go
-    :param max_drop: share of the baseline's return; None: there is no guard
-    :param goal: sparsity to end at; None: the guard says
-    :param batches: most batches of episodes to evaluate a level by
+    :param start: sparsity of the original model
+    :param floor: density below which no layer can lose more connections
+    :param max_drop: largest drop, as a share of the baseline's return; None: there is no guard
+    :param goal: sparsity to end at; None: the guard decides
+    :param batches: largest number of batches of episodes for a level
     """
 
     start: float
@@ -120,12 +122,12 @@ def search(
     save: Callable[[], None],
     say: Callable[[str], None],
 ) -> None:
-    """Try levels until the rules end it.
+    """Try levels until the rules end the search.
 
-    :param baseline: returns of the baseline so far, by batch; grows
-    :param levels: done so far; grows
-    :param save: called when a level is done, or a batch of the baseline
-    :param say: told of each level
+    :param baseline: returns of the baseline by batch; new batches are added
+    :param levels: finished levels; new ones are appended
+    :param save: called after each level and each batch of the baseline
+    :param say: called with a line for each level
     """
 
     def baseline_of(batch: int) -> list[float]:
@@ -136,7 +138,7 @@ def search(
 
     first = baseline_of(0)
     if rules.max_drop is not None:
-        tolerance(first, rules.max_drop)  # refused before anything is trained
+        tolerance(first, rules.max_drop)  # raises before anything is trained
     while True:
         sparsity = next_sparsity(levels, rules.start, rules.goal, rules.floor)
         if sparsity is None:
@@ -158,7 +160,7 @@ def _judged(
     sparsity: float,
     nnz: int,
 ) -> Level:
-    """Evaluate the candidate until it is decided, or the episodes are used up."""
+    """Evaluate the candidate until there is a decision or no batch is left."""
     candidate: list[float] = []
     whole: list[float] = []
     verdict = "undecided"

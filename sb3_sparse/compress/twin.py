@@ -1,4 +1,4 @@
-"""The sparse twin of a trained model."""
+"""Makes sparse twins of trained models."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ def sparsify(
     dense_layers: Sequence[str] | None = None,
     compute: str | None = None,
 ) -> Algorithm:
-    """A sparse twin of a trained model, dense or sparse already; the model stays as it is.
+    """Return a sparse twin of a trained model, which may be dense or sparse and is not changed.
 
-    Every layer keeps the connections of largest ``|weight|`` and their weights, and the twin acts
-    as the model with all others set to 0. It is of the same algorithm and hyperparameters, has the
-    same step count and optimizer states (0 where a connection is gone), and goes on training where
-    the model would. Environment and replay buffer are not copied but taken over, so train one of
-    the two. As ``load`` does, it seeds the generators if the model has a ``seed``.
+    Every layer keeps the weights of largest magnitude, so the twin acts as the model would with all
+    other weights set to 0. It has the same algorithm, hyperparameters, step count and optimizer
+    states (0 where a connection is gone), and continues training where the model would. It shares
+    the model's environment and replay buffer, so train only one of the two. Like ``load``, this
+    seeds the random generators if the model has a ``seed``.
 
     A model that is sparse already can only lose connections.
 
@@ -62,7 +62,15 @@ def sparsify(
     :raises UnsupportedError: for another algorithm or a policy class that has no sparse counterpart
     :raises Diverged: if the model's network is not finite
 
-    Source: magnitude pruning, arXiv:1506.02626; shared out by layer as arXiv:1911.11134, section 3.
+    Source: magnitude pruning, arXiv:1506.02626; distributions, arXiv:1911.11134, section 3.
+
+    Example::
+
+        from stable_baselines3 import SAC
+        from sb3_sparse import sparsify
+
+        twin = sparsify(SAC("MlpPolicy", "Pendulum-v1"), sparsity={"actor": 0.9, "critic": 0.0})
+        print(twin.policy.sparsity_report())
     """
     policy_class = _sparse_class(model)
     data, params, variables = parts_of(model)
@@ -70,7 +78,7 @@ def sparsify(
     given = {"distribution": distribution, "dense_layers": dense_layers, "compute": compute}
     data["policy_class"] = policy_class
     data["policy_kwargs"] = {
-        "mask_seed": model.seed or 0,  # not drawn, so that nothing of the twin hangs on luck
+        "mask_seed": model.seed or 0,  # not drawn, so that equal calls give equal twins
         **data["policy_kwargs"],
         "sparsity": dict(sparsity) if isinstance(sparsity, Mapping) else sparsity,
         "initial_sparsity": None,
@@ -93,9 +101,9 @@ def sparsify(
 def load_beside(
     model: Algorithm, file: io.BufferedIOBase | Path, force_reset: bool = True
 ) -> Algorithm:
-    """A saved model that works with the environment and replay buffer of another.
+    """Load a model that shares the environment and replay buffer of another.
 
-    :param force_reset: whether it begins with a reset of the environment
+    :param force_reset: whether the environment is reset before the model trains
     """
     loaded = load_without_buffer(
         type(model), file, env=model.env, device=model.device, force_reset=force_reset
@@ -106,14 +114,14 @@ def load_beside(
 
 
 def sparse_policy(model: BaseAlgorithm) -> BaseSparsePolicy:
-    """The policy of a model that is known to be sparse."""
+    """Return the policy of a model that is known to be sparse."""
     policy = unwrapped(model.policy)
     assert isinstance(policy, BaseSparsePolicy)
     return policy
 
 
 def sparsity_of(model: BaseAlgorithm) -> dict[str, float]:
-    """The sparsity that each network of a model was asked for; 0 throughout for a dense one.
+    """Return the sparsity of each network as configured; 0 for a dense model.
 
     :raises UnsupportedError: as :func:`sparsify`
     """
@@ -127,11 +135,13 @@ def sparsity_of(model: BaseAlgorithm) -> dict[str, float]:
 def magnitude_mask(
     weights: NDArray[np.float32], active: NDArray[np.bool_], count: int
 ) -> NDArray[np.bool_]:
-    """True at the ``count`` active weights of largest magnitude; ties keep the lowest index.
+    """Return a mask of the ``count`` active weights of largest magnitude.
+
+    Ties keep the lowest index.
 
     :param weights: shape ``(n,)``
-    :param active: which may stay, shape ``(n,)``
-    :param count: at most as many as are active
+    :param active: which weights may stay, shape ``(n,)``
+    :param count: at most the number of active weights
     """
     mask = np.zeros(weights.size, dtype=np.bool_)
     mask[largest(np.where(active, np.abs(weights), -1.0), count)] = True
@@ -139,7 +149,7 @@ def magnitude_mask(
 
 
 def _sparse_class(model: BaseAlgorithm) -> type[BaseSparsePolicy]:
-    """The sparse counterpart of a model's policy class."""
+    """Return the sparse counterpart of a model's policy class."""
     supported = supported_algorithms()
     if not isinstance(model, tuple(supported.values())):
         raise UnsupportedError(
@@ -155,16 +165,16 @@ def _sparse_class(model: BaseAlgorithm) -> type[BaseSparsePolicy]:
             return found
     names = [name for name in aliases if f"Sparse{name}" in aliases]
     raise UnsupportedError(
-        f"the policy {own.__module__}.{own.__qualname__} is none of SB3's own for "
-        f"{type(model).__name__} ({', '.join(names)}) and not sparse. Train it with one of these; "
+        f"the policy {own.__module__}.{own.__qualname__} is not one of SB3's own for "
+        f"{type(model).__name__} ({', '.join(names)}) and not sparse. Train with one of these; "
         "custom networks are welcome in policy_kwargs"
     )
 
 
 def _pruned(model: BaseAlgorithm, data: Mapping[str, Any], saved: StateDict) -> StateDict:
-    """What the state_dict of the twin's policy shall be.
+    """Return the state_dict of the twin's policy.
 
-    :param data: what the twin is made from
+    :param data: the twin's saved attributes
     :param saved: state_dict of the model's policy
     """
     policy = _masked_policy(data)
@@ -200,7 +210,7 @@ def _pruned(model: BaseAlgorithm, data: Mapping[str, Any], saved: StateDict) -> 
 
 
 def _masked_policy(data: Mapping[str, Any]) -> BaseSparsePolicy:
-    """A new policy of the twin's kind, on the CPU and with masks."""
+    """Make a new policy of the twin's class, on the CPU and with masks."""
     policy_class: type[BaseSparsePolicy] = data["policy_class"]
     kwargs = {**copy.deepcopy(data["policy_kwargs"]), "compute": "masked"}
     if data["use_sde"]:

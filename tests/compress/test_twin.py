@@ -264,7 +264,7 @@ class OwnPolicy(ActorCriticPolicy):
 
 def test_what_has_no_sparse_counterpart_is_refused():
     own = PPO(OwnPolicy, "CartPole-v1", n_steps=32, batch_size=16)
-    with pytest.raises(UnsupportedError, match=r"OwnPolicy is none of SB3's own for PPO \(MlpPol"):
+    with pytest.raises(UnsupportedError, match=r"OwnPolicy is not one of SB3's own for PPO \(Mlp"):
         sparsify(own, 0.9)
     contrib = pytest.importorskip("sb3_contrib")
     recurrent = contrib.RecurrentPPO("MlpLstmPolicy", "CartPole-v1", n_steps=32)
