@@ -1,4 +1,4 @@
-"""Torch's activations as operations of a graph."""
+"""Translates torch's activations to operations of a graph."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from torch.nn import functional
 from sb3_sparse.export.nodes import Activation, Affine, Clip, Node, Slopes
 
 Make = Callable[[int, tuple[int, ...]], Node]
-"""Makes a node of the value that it takes and that value's shape."""
+"""Makes a node, given its input value and the shape of that."""
 SELU_ALPHA = 1.6732632423543772
 SELU_SCALE = 1.0507009873554805
-"""As torch has them. Source: arXiv:1706.02515."""
+"""Torch's constants. Source: arXiv:1706.02515."""
 
 
 def nodes_of(module: nn.Module) -> list[Make] | None:
-    """What a module of torch's that works element by element does; None for any other."""
+    """Return what an elementwise module of torch does; None for any other module."""
     made = FORMULAS.get(type(module))
     return None if made is None else made(module)
 
 
 def called(function: Any, arguments: list[Any], options: dict[str, Any]) -> nn.Module | None:
-    """The module that does what a call of a function, or of a tensor's method, does.
+    """Return the module that does the same as a call of a function or of a tensor's method.
 
     :param function: the function, or the method's name
-    :param arguments: behind the tensor
-    :param options: by keyword
-    :return: None if there is none
+    :param arguments: positional arguments after the tensor
+    :param options: keyword arguments
+    :return: None if there is no such module
     """
     kind = FUNCTIONS.get(function)
     if kind is None:
@@ -48,7 +48,7 @@ def _each(kind: str, **parameters: float) -> list[Make]:
 
 
 def scaled(factor: float, shift: float = 0.0) -> list[Make]:
-    """Nothing, if it changes nothing."""
+    """Return ``x * factor + shift``, or nothing if that is ``x``."""
 
     def make(value: int, shape: tuple[int, ...]) -> Node:
         units = np.ones(shape[0], np.float32)
@@ -82,7 +82,7 @@ def _flatten(start_dim: int = 0, end_dim: int = -1) -> nn.Module:
 
 
 def _dropout(p: float = 0.5, training: bool = True) -> nn.Module:
-    if training:  # which it then is in evaluation, too
+    if training:  # the function's default, in evaluation too
         raise TypeError("random actions cannot be exported")
     return nn.Identity()
 
@@ -119,31 +119,11 @@ FORMULAS: dict[type[nn.Module], Callable[[Any], list[Make]]] = {
 }
 FUNCTIONS: dict[Any, Callable[..., nn.Module]] = {
     **{
-        getattr(functional, name): kind
-        for name, kind in {
-            "relu": nn.ReLU,
-            "leaky_relu": nn.LeakyReLU,
-            "elu": nn.ELU,
-            "selu": nn.SELU,
-            "celu": nn.CELU,
-            "tanh": nn.Tanh,
-            "sigmoid": nn.Sigmoid,
-            "silu": nn.SiLU,
-            "gelu": nn.GELU,
-            "mish": nn.Mish,
-            "softplus": nn.Softplus,
-            "logsigmoid": nn.LogSigmoid,
-            "softsign": nn.Softsign,
-            "hardswish": nn.Hardswish,
-            "hardsigmoid": nn.Hardsigmoid,
-            "hardtanh": nn.Hardtanh,
-            "relu6": nn.ReLU6,
-            "tanhshrink": nn.Tanhshrink,
-            "softshrink": nn.Softshrink,
-            "hardshrink": nn.Hardshrink,
-            "threshold": nn.Threshold,
-        }.items()
+        getattr(functional, kind.__name__.lower()): kind
+        for kind in FORMULAS
+        if hasattr(functional, kind.__name__.lower()) and kind not in (nn.PReLU, nn.RReLU)
     },
+    functional.leaky_relu: nn.LeakyReLU,
     **dict.fromkeys((th.relu, "relu"), nn.ReLU),
     **dict.fromkeys((th.tanh, "tanh"), nn.Tanh),
     **dict.fromkeys((th.sigmoid, "sigmoid"), nn.Sigmoid),
@@ -153,5 +133,5 @@ FUNCTIONS: dict[Any, Callable[..., nn.Module]] = {
     functional.dropout: _dropout,
     "float": nn.Identity,
 }
-"""What a ``forward`` may call on its own, as a function or a method."""
+"""The functions and methods that a ``forward`` may call, and the modules that do the same."""
 NAMES = ", ".join(kind.__name__ for kind in FORMULAS)

@@ -1,4 +1,4 @@
-"""What a launcher is given, what it does, and what it gives back."""
+"""Tasks, their results, and the interface of launchers."""
 
 from __future__ import annotations
 
@@ -18,13 +18,22 @@ POLL_SECONDS = 1.0
 
 @dataclass(frozen=True)
 class Task:
-    """A call to be made in a process of its own.
+    """A function call to make in another process.
 
-    :param name: for messages
-    :param function: ``"package.module:name"`` of what is called; a path, so that the number of
+    :param name: name for messages
+    :param function: ``"package.module:name"`` of the function; a path, so that the number of
         threads is set before anything is imported
-    :param arguments: its keyword arguments; must pickle
-    :param log: file that the process's output is appended to; None: dropped
+    :param arguments: keyword arguments; must be picklable
+    :param log: file that the output of the process is appended to; None: the output is dropped
+
+    Example::
+
+        from sb3_sparse.launch import Task, launcher_named
+
+        tasks = [Task(text, "json:loads", {"s": text}) for text in ("1", "[2]")]
+        for result in launcher_named("local").run(tasks, workers=2):
+            if result is not None:  # None comes once a second, to show progress
+                print(result.task.name, result.value, result.error)
     """
 
     name: str
@@ -33,17 +42,17 @@ class Task:
     log: Path | None = None
 
     def __call__(self) -> Any:
-        """Make the call, here."""
+        """Make the call in this process."""
         module, _, name = self.function.partition(":")
         return getattr(importlib.import_module(module), name)(**self.arguments)
 
     def packed(self) -> bytes:
-        """Bytes for another process, with where this one finds its modules."""
+        """Return bytes for another process, including where this process finds its modules."""
         return pickle.dumps((list(sys.path), pickle.dumps(self)))
 
     @staticmethod
     def unpacked(content: bytes) -> Task:
-        """The task of :meth:`packed`; modules are found where that process found them, too."""
+        """Restore a task from :meth:`packed`, and find modules where that process found them."""
         path, task = pickle.loads(content)
         sys.path.extend(folder for folder in path if folder not in sys.path)
         found: Task = pickle.loads(task)
@@ -52,11 +61,11 @@ class Task:
 
 @dataclass(frozen=True)
 class TaskResult:
-    """A task that is over.
+    """The result of a task.
 
-    :param task: which
-    :param value: what its function returned; None if it failed
-    :param error: what went wrong, in words or as a traceback; None if nothing did
+    :param task: the task
+    :param value: the function's return value; None if it failed
+    :param error: a message or traceback if it failed; None otherwise
     """
 
     task: Task
@@ -65,24 +74,24 @@ class TaskResult:
 
 
 class Launcher(ABC):
-    """Runs tasks in processes of one thread each, and never more than so many at a time."""
+    """Runs tasks in processes of one thread each."""
 
     @abstractmethod
     def run(self, tasks: Sequence[Task], workers: int) -> Generator[TaskResult | None, None, None]:
-        """Run the tasks in their order; yields each that ends, and None once in a second without.
+        """Run the tasks in order; yield each result, and None after each second without one.
 
-        A task that fails or whose process is killed takes no other with it. Closing the iterator
-        asks the running ones to stop, waits for them, and starts no more.
+        A task that fails or whose process is killed does not affect the others. Closing the
+        iterator asks running tasks to stop, waits for them, and starts no more.
 
-        :param tasks: what is to be done
-        :param workers: how many at a time, 1 or more
+        :param tasks: the tasks
+        :param workers: number of tasks to run at a time, 1 or more
         """
 
 
 def check_workers(workers: int) -> None:
-    """Refuse a number of workers that is none.
+    """Reject a number of workers below 1.
 
-    :raises ConfigError: if so
+    :raises ConfigError: if ``workers`` is below 1
     """
     if workers < 1:
         raise ConfigError(f"workers must be 1 or more, got {workers}")

@@ -1,4 +1,4 @@
-"""Tasks as processes of this machine."""
+"""Runs tasks as processes of this machine."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from typing import IO
 
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.launch.base import POLL_SECONDS, Launcher, Task, TaskResult, check_workers
-from sb3_sparse.launch.jobs import Job, Plan
+from sb3_sparse.launch.child import Job, Plan
 
 SHOWN_LINES = 15
 
 
 class LocalLauncher(Launcher):
-    """Each task in a process of its own with one thread.
+    """Runs each task in its own process with one thread.
 
-    One process imports the modules of all tasks, and forks for each of them: a task begins within
-    a moment. The modules must start no threads when they are imported.
+    One process imports the modules of all tasks and forks for each task, so that tasks start at
+    once. The modules must not start threads when they are imported.
 
     :param address: must be None
     """
@@ -56,15 +56,15 @@ class LocalLauncher(Launcher):
                         break
                     number, code = map(int, answer.split())
                     yield _ended(waiting.pop(number), jobs[number], code)
-            for task in waiting.values():  # nobody will run them
+            for task in waiting.values():  # the server ended early
                 yield TaskResult(task, error=_error(server.process.returncode, output))
 
 
 class _Server:
-    """The process that forks, while the context lasts.
+    """Keeps the process that forks alive for the duration of a block.
 
-    :param plan: what it does
-    :param output: file of what it prints, other than its answers
+    :param plan: what the process does
+    :param output: file for its output, except its answers
     """
 
     def __init__(self, plan: Plan, output: Path) -> None:
@@ -85,9 +85,9 @@ class _Server:
         assert self.process.stdout is not None
         self.reader = Thread(target=_read, args=(self.process.stdout, self.answers), daemon=True)
         self.reader.start()
-        with suppress(BrokenPipeError):  # the exit code says more
+        with suppress(BrokenPipeError):  # the exit code explains more
             self.process.stdin.write(pickle.dumps(self.plan))
-            self.process.stdin.flush()  # and stays open: its end stops all tasks
+            self.process.stdin.flush()  # stays open: closing it stops all tasks
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -119,7 +119,7 @@ def _ended(task: Task, job: Job, code: int) -> TaskResult:
 
 
 def _error(code: int, log: Path) -> str:
-    """What to say of a process that ended before its task did."""
+    """Describe why a process ended before its task did."""
     how = f"was killed by {signal.Signals(-code).name}" if code < 0 else f"exited with {code}"
     lines = log.read_text(errors="replace").splitlines()[-SHOWN_LINES:]
     return "\n".join([f"its process {how}", *(lines if code > 0 else [])])

@@ -1,4 +1,4 @@
-"""Tasks on a Ray cluster."""
+"""Runs tasks on a Ray cluster."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ GRACE = 60.0  # seconds for a task to stop when it is asked to
 
 
 class RayLauncher(Launcher):
-    """Each task as a Ray task that asks for one CPU; Ray places them, here or elsewhere.
+    """Runs each task as a Ray task that requests one CPU, on whichever machine Ray chooses.
 
-    Every machine of the cluster needs the same version of this package and sees the same folders
-    and storage. Where this process is connected to a cluster already, that one is taken.
+    Every machine of the cluster needs the same version of this package and must see the same
+    folders and storage. If this process is connected to a cluster already, that one is used.
 
-    :param address: of the cluster, e.g. ``"auto"`` or ``"ray://head:10001"``; None: a cluster of
-        this machine alone, for as long as the tasks run
-    :raises MissingExtra: where Ray is not installed
+    :param address: address of the cluster, e.g. ``"auto"`` or ``"ray://head:10001"``; None: a
+        cluster of this machine alone, for as long as the tasks run
+    :raises MissingExtra: if Ray is not installed
     """
 
     def __init__(self, address: str | None = None) -> None:
@@ -83,7 +83,7 @@ class RayLauncher(Launcher):
         try:
             value, error = self.ray.get(reference)
         except self.ray.exceptions.RayError as failure:
-            return TaskResult(task, error=f"Ray says: {failure}")
+            return TaskResult(task, error=f"Ray reports: {failure}")
         return TaskResult(task, value, error)
 
 

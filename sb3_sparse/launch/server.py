@@ -1,4 +1,4 @@
-"""A process that imports what tasks need, once, and then forks a process for each of them."""
+"""A process that imports what tasks need once, and then forks a process for each task."""
 
 from __future__ import annotations
 
@@ -17,39 +17,38 @@ from multiprocessing.process import BaseProcess
 from threading import Thread
 from typing import Any
 
-from sb3_sparse.launch.child import do
-from sb3_sparse.launch.jobs import Plan
+from sb3_sparse.launch.child import Plan, run_job
 
 new_process: Callable[..., BaseProcess] = get_context("spawn").Process
 if sys.platform == "linux":
     new_process = get_context("fork").Process
-"""Elsewhere a process cannot be relied on after a fork without a new program."""
+"""On other systems, a process may fail after a fork."""
 
 
 def main() -> None:
-    """Read a plan from standard input, and print number and exit code of each job that is over.
+    """Read a plan from standard input, and print number and exit code of each finished job.
 
-    When the input ends, which it does when the process that started this one is gone, the jobs that
-    run are asked to stop and no other is begun.
+    When the input ends, as it does when the process that started this one disappears, running jobs
+    are asked to stop and no other is started.
     """
     plan: Plan = pickle.load(sys.stdin.buffer)
     answers = os.fdopen(os.dup(1), "w")
-    os.dup2(2, 1)  # what modules print is no answer
+    os.dup2(2, 1)  # keeps the output of modules apart from answers
     sys.path.extend(folder for folder in plan.path if folder not in sys.path)
     for module in plan.modules:
-        with suppress(Exception):  # the job will fail by it, and say so
+        with suppress(Exception):  # the job fails with the same error, and reports it
             import_module(module)
     if "torch" in sys.modules:
-        import_module("torch._dynamo")  # as its first optimizer does, which takes a second
-    gc.freeze()  # or each job's collections would copy all pages
-    interrupt = signal.signal(signal.SIGINT, signal.SIG_IGN)  # of which jobs hear by themselves
+        import_module("torch._dynamo")  # otherwise each first optimizer does, which takes a second
+    gc.freeze()  # otherwise garbage collection would copy all pages in each job
+    interrupt = signal.signal(signal.SIGINT, signal.SIG_IGN)  # jobs receive it themselves
     end = _end_of_input()
     waiting, stopped = deque(enumerate(plan.jobs)), False
     alive: dict[int, tuple[int, BaseProcess]] = {}
     while alive or (waiting and not stopped):
         while waiting and not stopped and len(alive) < plan.workers:
             number, job = waiting.popleft()
-            process = new_process(target=do, args=(job, interrupt))
+            process = new_process(target=run_job, args=(job, interrupt))
             process.start()
             alive[process.sentinel] = number, process
         for ready in wait([*alive, *([] if stopped else [end])]):
@@ -64,7 +63,7 @@ def main() -> None:
 
 
 def _end_of_input() -> Any:
-    """What :func:`wait` takes, and finds ready when the input ends."""
+    """Return what becomes ready for :func:`wait` when the input ends."""
     if sys.platform != "win32":
         return sys.stdin.fileno()
     reader, writer = Pipe(duplex=False)

@@ -188,7 +188,7 @@ def test_what_acts_otherwise_is_not_written_unless_forced(model, to, monkeypatch
     report = export_policy(model, tmp_path / "policy", to, force=True)
     assert written(tmp_path)
     assert not report.parity.holds
-    assert "note: written though it does not act as the model" in str(report)
+    assert "note: written although it does not act as the model" in str(report)
 
 
 def test_a_discrete_action_that_differs_is_told_with_the_gap_of_the_scores(monkeypatch, tmp_path):

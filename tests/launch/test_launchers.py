@@ -12,11 +12,11 @@ from contextlib import closing
 import pytest
 
 from sb3_sparse.errors import ConfigError, MissingExtra
-from sb3_sparse.launch import Task, launcher_named, launcher_names
+from sb3_sparse.launch import LAUNCHERS, Task, launcher_named
 from sb3_sparse.studies import runner
 from sb3_sparse.tuning import search
 
-NAMES = launcher_names()
+NAMES = list(LAUNCHERS)
 
 
 def ended(launcher, tasks, workers=2):
