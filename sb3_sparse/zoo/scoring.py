@@ -87,7 +87,8 @@ def enjoy(
     if video and importlib.util.find_spec("moviepy") is None:
         raise MissingExtra("recording a video", "video")
     if video and sys.platform == "linux" and not os.environ.get("DISPLAY"):
-        os.environ.setdefault("MUJOCO_GL", "egl")  # MuJoCo's way to render without a display
+        os.environ.setdefault("MUJOCO_GL", "egl")  # lets MuJoCo render without a display
+        os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # lets pygame draw without one
     set_random_seed(seed)
     kwargs: dict[str, Any] = {"render_mode": "rgb_array"} if video else {}
     env = envs_of(saved, 1, seed, env_kwargs=kwargs)
@@ -115,7 +116,7 @@ def enjoy(
             )
             on_episode(episodes)
     finally:
-        with quiet():
+        with _filmed(saved, video), quiet():  # closing may write the video
             env.close()
     assert not isinstance(mean, list)
     assert not isinstance(std, list)
@@ -125,15 +126,15 @@ def enjoy(
 
 @contextmanager
 def _filmed(saved: Saved, video: bool) -> Iterator[None]:
-    """Within it, what goes wrong while a video is made is said of the video.
+    """Turn errors while a video is made into errors about the video.
 
-    MoviePy's own bar, which it draws on stderr wherever that goes, is left out.
+    MoviePy's own progress bar, which always goes to stderr, is dropped.
     """
     try:
         with redirect_stderr(io.StringIO()) if video else nullcontext():
             yield
     except OSError:
-        raise  # a folder that cannot be written to names itself
+        raise  # the error already names the folder that cannot be written to
     except Exception as error:
         if not video:
             raise
