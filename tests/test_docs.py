@@ -35,9 +35,6 @@ ROOT = Path(__file__).parent.parent
 DOORS = ["", ".algorithms", ".analysis", ".compress", ".export", ".fused", ".networks", ".report"]
 DOORS += [".sparsity", ".studies", ".topology", ".tuning", ".zoo"]
 WITHOUT_EXAMPLE: set[str] = {
-    "sb3_sparse.compress.Compression",
-    "sb3_sparse.export.ExportReport",
-    "sb3_sparse.export.Parity",
     "sb3_sparse.report.LeftOut",
     "sb3_sparse.report.RunData",
     "sb3_sparse.studies.CellStatus",

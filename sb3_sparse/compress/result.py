@@ -24,6 +24,16 @@ class Compression:
     :param change: change of the return, from pairs of episodes
     :param episodes: number of episodes that each model played
     :param levels: the sparsities that were tried
+
+    Example::
+
+        from stable_baselines3 import PPO
+        from stable_baselines3.common.env_util import make_vec_env
+        from sb3_sparse.compress import compress_model
+
+        model = PPO("MlpPolicy", "CartPole-v1", n_steps=64).learn(64)
+        envs = make_vec_env("CartPole-v1")
+        print(compress_model(model, envs, "smaller", sparsity=0.5, steps=64, episodes=2))
     """
 
     path: Path

@@ -79,16 +79,6 @@ def compress_model(
     :raises CorruptStateError: if the folder is damaged
 
     Source: iterative magnitude pruning, arXiv:1506.02626, section 3.
-
-    Example::
-
-        from stable_baselines3 import PPO
-        from stable_baselines3.common.env_util import make_vec_env
-        from sb3_sparse.compress import compress_model
-
-        model = PPO("MlpPolicy", "CartPole-v1", n_steps=64).learn(64)
-        envs = make_vec_env("CartPole-v1")
-        print(compress_model(model, envs, "smaller", sparsity=0.5, steps=64, episodes=2))
     """
     settings = _settings(model, eval_env, max_drop, sparsity, steps, episodes, seed)
     settings |= {"deterministic": deterministic, "distribution": distribution, "name": name}

@@ -63,14 +63,6 @@ def sparsify(
     :raises Diverged: if the model's network is not finite
 
     Source: magnitude pruning, arXiv:1506.02626; distributions, arXiv:1911.11134, section 3.
-
-    Example::
-
-        from stable_baselines3 import SAC
-        from sb3_sparse import sparsify
-
-        twin = sparsify(SAC("MlpPolicy", "Pendulum-v1"), sparsity={"actor": 0.9, "critic": 0.0})
-        print(twin.policy.sparsity_report())
     """
     policy_class = _sparse_class(model)
     data, params, variables = parts_of(model)

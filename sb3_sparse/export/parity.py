@@ -1,4 +1,4 @@
-"""Whether an exported policy acts as the model does."""
+"""Compares an exported policy with its model."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from sb3_sparse.errors import SparsityError
 from sb3_sparse.export.observations import Observations, count_of, rows_of
 
 Actor = Callable[[Observations], NDArray[Any]]
-"""From raw observations, one a row, to flat actions, one a row."""
+"""Maps raw observations, one per row, to flat actions, one per row."""
 TOLERANCE = 1e-5
 BATCH = 64
 
@@ -24,15 +24,21 @@ class ParityError(SparsityError, ValueError):
 
 @dataclass(frozen=True)
 class Parity:
-    """How far apart two policies are.
+    """The difference between two policies.
 
-    :param recorded: observations from an environment that both saw
-    :param random: random ones
-    :param difference: of continuous actions: the largest ``|a - b| / max(1, |a|, span)``, where the
-        span is half the range of an action that is squashed into it
-    :param different: of discrete ones: observations for which they differ
-    :param discrete: which of the two counts
-    :param worst: the observation of the difference
+    :param recorded: number of observations recorded in an environment
+    :param random: number of random observations
+    :param difference: largest ``|a - b| / max(1, |a|, span)`` of continuous actions, where span is
+        half the range that an action is squashed into
+    :param different: number of observations for which discrete actions differ
+    :param discrete: whether actions are discrete, so that ``different`` counts
+    :param worst: the observation with the largest difference
+
+    Example::
+
+        from sb3_sparse.export import Parity
+
+        assert Parity(0, 1000, difference=2e-6, different=0, discrete=False).holds
     """
 
     recorded: int
@@ -44,7 +50,7 @@ class Parity:
 
     @property
     def holds(self) -> bool:
-        """Whether the two are the same policy, up to rounding."""
+        """Whether the two policies are equal up to rounding."""
         return self.different == 0 if self.discrete else self.difference <= TOLERANCE
 
     def __str__(self) -> str:
@@ -65,8 +71,8 @@ def compare(
 ) -> Parity:
     """Run both policies on all observations.
 
-    :param recorded: None: there are none
-    :param span: see :class:`Parity`, shape ``(actions,)``; rounding grows with it
+    :param recorded: observations recorded in an environment; None: none
+    :param span: see :class:`Parity`, shape ``(actions,)``; rounding errors grow with it
     """
     difference, different, worst = 0.0, 0, None
     for observations in (recorded, random):

@@ -53,6 +53,14 @@ class ExportReport:
         ``"dense"``, as the counts of units
     :param removed_units: number of dead units
     :param units: number of units before
+
+    Example::
+
+        from stable_baselines3 import PPO
+        from sb3_sparse.export import export_policy
+
+        model = PPO("SparsePolicy", "CartPole-v1", policy_kwargs=dict(sparsity=0.9))
+        print(export_policy(model, "policy", to="numpy"))
     """
 
     files: dict[Path, int]
@@ -117,14 +125,6 @@ def export_policy(
     :raises ParityError: if the export does not act as the model: if continuous actions differ by
         more than 1e-5, relative to their size above 1 and to the range they are squashed into, or
         if any discrete action differs
-
-    Example::
-
-        from stable_baselines3 import PPO
-        from sb3_sparse.export import export_policy
-
-        model = PPO("SparsePolicy", "CartPole-v1", policy_kwargs=dict(sparsity=0.9))
-        print(export_policy(model, "policy", "numpy"))
     """
     check_format(to)
     if int8 and to != "c":

@@ -25,15 +25,6 @@ class Task:
         threads is set before anything is imported
     :param arguments: keyword arguments; must be picklable
     :param log: file that the output of the process is appended to; None: the output is dropped
-
-    Example::
-
-        from sb3_sparse.launch import Task, launcher_named
-
-        tasks = [Task(text, "json:loads", {"s": text}) for text in ("1", "[2]")]
-        for result in launcher_named("local").run(tasks, workers=2):
-            if result is not None:  # None comes once a second, to show progress
-                print(result.task.name, result.value, result.error)
     """
 
     name: str
