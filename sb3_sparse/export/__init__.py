@@ -1,4 +1,4 @@
-"""Policies that run elsewhere: C, NumPy, ONNX, and zips of stock SB3."""
+"""Export policies as C, NumPy, ONNX, or zips of stock SB3."""
 
 from __future__ import annotations
 

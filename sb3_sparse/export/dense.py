@@ -1,4 +1,4 @@
-"""A sparse model as a zip of stock SB3, which loads and trains on without this package."""
+"""Writes a sparse model as a zip of stock SB3, which needs nothing of this package."""
 
 from __future__ import annotations
 
@@ -31,16 +31,16 @@ FORGOTTEN = (
     "tensorboard_log",
     "start_time",
 )
-"""What a model remembers of where and when it was trained; ``learn`` makes it anew."""
+"""Attributes about where and when a model was trained; ``learn`` sets them again."""
 LONG_AGO = (1980, 1, 1, 0, 0, 0)
 
 
 def write_dense(model: BaseAlgorithm) -> bytes:
-    """Bytes of the zip: weights and optimizer moments, 0 where there is no connection.
+    """Return the bytes of the zip; weights and optimizer moments are 0 without a connection.
 
-    Training on in stock SB3 is dense: nothing keeps the zeros.
+    If stock SB3 trains the model further, it becomes dense: nothing keeps the zeros.
 
-    :raises UnsupportedError: if the model has classes of this package that SB3 lacks
+    :raises UnsupportedError: if the model needs classes of this package
     """
     data, params, variables = parts_of(model)
     policy = unwrapped(model.policy)
@@ -58,7 +58,7 @@ def write_dense(model: BaseAlgorithm) -> bytes:
 
 
 def _stock_class(policy: type[BasePolicy]) -> type[BasePolicy]:
-    """What a sparse policy class makes sparse; any other class itself."""
+    """Return the stock class below a sparse policy class; any other class unchanged."""
     if not issubclass(policy, BaseSparsePolicy):
         return policy
     for cls in policy.__mro__:
@@ -68,23 +68,23 @@ def _stock_class(policy: type[BasePolicy]) -> type[BasePolicy]:
         if not cls.__module__.startswith("sb3_sparse."):
             break
     raise UnsupportedError(
-        f"{policy.__module__}.{policy.__qualname__} is a sparse policy of your own, which has no "
-        "stock class; export to onnx, numpy or c instead"
+        f"{policy.__module__}.{policy.__qualname__} is your own sparse policy, which has no stock "
+        "class; export to onnx, numpy or c instead"
     )
 
 
 def _stock_kwargs(policy: BasePolicy, kwargs: dict[str, Any]) -> dict[str, Any]:
-    """Policy arguments without those of sparse policies, the classes among them imported."""
+    """Remove the arguments of sparse policies, and import the classes among the others."""
     sparse = SparsityConfig.__dataclass_fields__
     stock = {name: value for name, value in kwargs.items() if name not in sparse}
     import_classes(stock)
-    if isinstance(policy, BaseSparsePolicy):  # which may have another by default
+    if isinstance(policy, BaseSparsePolicy):  # whose default may differ
         stock["features_extractor_class"] = policy.features_extractor_class
     return stock
 
 
 def _zipped(data: dict[str, Any], params: Any, variables: Any) -> bytes:
-    """As SB3 writes it, but with the same bytes each time."""
+    """Write a zip as SB3 does, but with the same bytes each time."""
     texts = {name: _as_json(name, value) for name, value in data.items()}
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w") as archive:
@@ -107,8 +107,8 @@ def _as_json(name: str, value: Any) -> Any:
     content = pickled(value)
     if b"sb3_sparse" in content:
         raise UnsupportedError(
-            f"the model's {name} is {value}, which needs sb3_sparse to be loaded; dense zips can "
-            "have SB3's own networks and classes of yours. Export to onnx, numpy or c instead"
+            f"the model's {name} is {value}, which needs sb3_sparse to be loaded; dense zips may "
+            "contain SB3's networks and your own classes. Export to onnx, numpy or c instead"
         )
     return {":type:": str(type(value)), ":serialized:": base64.b64encode(content).decode()}
 

@@ -1,4 +1,4 @@
-"""From an SB3 model to the graph of its deterministic actions."""
+"""Translates an SB3 model to the graph of its deterministic actions."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from sb3_sparse.policies.registry import sparse_counterpart, supported_algorithm
 
 
 def graph_of(model: BaseAlgorithm, normalization: VecNormalize | None) -> Graph:
-    """The operations from a raw observation to the action of ``predict(deterministic=True)``.
+    """Return the operations from a raw observation to ``predict(deterministic=True)``.
 
-    :param model: of a supported algorithm, its policy sparse or stock
+    :param model: a model of a supported algorithm, with a sparse or stock policy
     :param normalization: what normalises observations before the policy sees them
     :raises UnsupportedError: for a network or space that cannot be exported
     """
@@ -74,12 +74,11 @@ def graph_of(model: BaseAlgorithm, normalization: VecNormalize | None) -> Graph:
 
 
 def check_model(model: BaseAlgorithm) -> None:
-    """Refuse a model that nothing good can come of.
+    """Reject a model that cannot be exported correctly.
 
     :raises UnsupportedError: for an algorithm that is not supported, or weights that are not
         float32
     :raises Diverged: if a weight is not finite
-    :raises CorruptStateError: if a weight is not 0 where its mask has nothing
     """
     supported = supported_algorithms()
     if not isinstance(model, tuple(supported.values())):
@@ -102,7 +101,7 @@ def _ends_in_tanh(module: nn.Module) -> bool:
 
 
 def _mean_quantiles(tracer: Tracer, value: int, quantiles: int) -> int:
-    """QR-DQN acts by the mean over quantiles, which its last layer may as well compute."""
+    """Let the last layer compute the mean over quantiles, by which QR-DQN acts."""
     last = tracer.nodes[value - 1]
     if not isinstance(last, Linear):
         raise UnsupportedError("a quantile network that does not end in a Linear layer")
@@ -116,7 +115,7 @@ def _mean_quantiles(tracer: Tracer, value: int, quantiles: int) -> int:
 
 
 def _box(tracer: Tracer, value: int, policy: Any, space: spaces.Box) -> None:
-    """From the network's output to an action within its bounds, as SB3 has it."""
+    """Clip or rescale the network's output to the action's bounds, as SB3 does."""
     low = space.low.reshape(-1).astype(np.float32)
     high = space.high.reshape(-1).astype(np.float32)
     shape = tracer.shape_of(value)
@@ -129,7 +128,7 @@ def _box(tracer: Tracer, value: int, policy: Any, space: spaces.Box) -> None:
 
 
 def span_of(model: BaseAlgorithm) -> NDArray[np.float64]:
-    """Half the range of each action that is squashed into it, shape ``(actions,)``; else 0."""
+    """Return half the range that each action is squashed into, shape ``(actions,)``; else 0."""
     space = model.action_space
     if not (isinstance(space, spaces.Box) and unwrapped(model.policy).squash_output):
         return np.zeros(1)

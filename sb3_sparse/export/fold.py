@@ -1,4 +1,4 @@
-"""Folds scales and shifts into the layers beside them, which changes nothing but rounding."""
+"""Folds scales and shifts into neighbouring layers, which changes nothing but rounding."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from sb3_sparse.export.nodes import Affine, Conv, Node, Weighted
 
 
 def fold(graph: Graph) -> Graph:
-    """A graph without the :class:`Affine` nodes that a neighbouring layer can do the work of.
+    """Remove the :class:`Affine` nodes that a neighbouring layer can compute, and unread values.
 
-    Batch normalisation and the division of pixels by 255 disappear so, and values nobody reads.
+    Batch normalisation and the division of pixels by 255 disappear this way.
     """
     for number in range(len(graph.nodes) - 1):
         if not graph.users(number + 1):
@@ -30,9 +30,9 @@ def fold(graph: Graph) -> Graph:
 
 
 def rewrite(graph: Graph, changed: Mapping[int, Node | None]) -> Graph:
-    """A graph with some nodes replaced, or left out: their input then takes their place.
+    """Replace or remove nodes of a graph; users of a removed node read its input instead.
 
-    :param changed: by number of the node
+    :param changed: new nodes by number; None removes a node
     """
     places = [0]
     nodes: list[Node] = []
@@ -48,7 +48,7 @@ def rewrite(graph: Graph, changed: Mapping[int, Node | None]) -> Graph:
 
 
 def _into_producer(graph: Graph, number: int, node: Affine) -> dict[int, Node]:
-    """Rows of the layer before, if nobody else looks at its result."""
+    """Fold a node into the rows of the layer before, unless others read that layer's result."""
     (value,) = node.inputs
     layer = graph.nodes[value - 1] if value else None
     if not isinstance(layer, Weighted) or len(graph.users(value)) > 1:
@@ -60,7 +60,7 @@ def _into_producer(graph: Graph, number: int, node: Affine) -> dict[int, Node]:
 
 
 def _into_users(graph: Graph, number: int, node: Affine) -> dict[int, Node]:
-    """Columns of the layers behind, if there is nothing else and no border of zeros in the way."""
+    """Fold a node into the columns of its users, if all are layers without a border of zeros."""
     changed: dict[int, Node] = {}
     for user, layer in enumerate(graph.nodes):
         if number + 1 not in layer.inputs:
@@ -78,5 +78,5 @@ def _into_users(graph: Graph, number: int, node: Affine) -> dict[int, Node]:
 
 
 def with_weights(layer: Weighted, weight: NDArray[Any], bias: NDArray[Any]) -> Weighted:
-    """The layer with other weights, in float32."""
+    """Return the layer with other weights, in float32."""
     return replace(layer, weight=weight.astype(np.float32), bias=bias.astype(np.float32))

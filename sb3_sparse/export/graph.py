@@ -1,4 +1,4 @@
-"""A deterministic policy as a list of operations, which every format is written from."""
+"""A deterministic policy as a list of operations, from which most formats are written."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from sb3_sparse.export.nodes import Argmax, Node, Positive, Weighted
 
 @dataclass(frozen=True)
 class Part:
-    """A part of an observation that is a dict.
+    """A part of a dict observation.
 
-    :param key: its key
-    :param shape: as the policy sees it (images channels first), ``()`` of a single number
-    :param pixels: whether it is an image of uint8
+    :param key: the part's key
+    :param shape: shape as the policy sees it (images channels first), ``()`` for a single number
+    :param pixels: whether it is a uint8 image
     """
 
     key: str
@@ -26,7 +26,7 @@ class Part:
 
     @property
     def size(self) -> int:
-        """How many numbers it has."""
+        """Number of elements."""
         return int(np.prod(self.shape))
 
 
@@ -34,11 +34,12 @@ class Part:
 class Graph:
     """A policy: from one observation to its action.
 
-    :param observation_shape: of one observation, as the policy sees it (images channels first); a
-        dict is one row, its parts behind each other
-    :param nodes: in an order in which they can be run; the last one's result is the action
-    :param action_shape: of one action
-    :param images: whether observations are images of uint8
+    :param observation_shape: shape of one observation as the policy sees it (images channels
+        first); a dict is one row that concatenates its parts
+    :param nodes: operations in execution order; the last result is the action
+    :param action_shape: shape of one action
+    :param images: whether observations are uint8 images
+    :param parts: the parts of a dict observation
     """
 
     observation_shape: tuple[int, ...]
@@ -46,7 +47,6 @@ class Graph:
     action_shape: tuple[int, ...] = ()
     images: bool = False
     parts: tuple[Part, ...] = ()
-    """Of observations that are dicts."""
 
     @property
     def discrete(self) -> bool:
@@ -60,26 +60,26 @@ class Graph:
 
     @property
     def nnz(self) -> int:
-        """Connections that are not 0."""
+        """Number of connections that are not 0."""
         return sum(layer.nnz for layer in self.layers)
 
     def shape_of(self, value: int) -> tuple[int, ...]:
-        """Shape of a value; 0 is the observation."""
+        """Return the shape of a value; value 0 is the observation."""
         return self.nodes[value - 1].shape if value else self.observation_shape
 
     def users(self, value: int) -> list[Node]:
-        """The nodes that take a value."""
+        """Return the nodes that read a value."""
         return [node for node in self.nodes if value in node.inputs]
 
     def rows(self, observations: Any) -> NDArray[np.float32]:
-        """A batch of observations, perhaps in a dict, as an array of the shape that it computes."""
+        """Convert a batch of observations, which may be a dict, to the shape of value 0."""
         if self.parts:
             rows = [np.reshape(observations[p.key], (-1, p.size)) for p in self.parts]
             observations = np.concatenate([row.astype(np.float32) for row in rows], axis=1)
         return np.asarray(observations, np.float32).reshape(-1, *self.observation_shape)
 
     def values(self, observations: Any) -> list[NDArray[Any]]:
-        """Every value for a batch of observations, the batch last."""
+        """Compute all values for a batch of observations; the batch is the last axis."""
         batch = self.rows(observations)
         values: list[NDArray[Any]] = [np.moveaxis(batch, 0, -1)]
         for node in self.nodes:
@@ -87,6 +87,6 @@ class Graph:
         return values
 
     def run(self, observations: Any) -> NDArray[Any]:
-        """Actions of a batch of observations, one a row, flat: shape ``(batch, actions)``."""
+        """Compute the flat actions of a batch of observations, shape ``(batch, actions)``."""
         result = np.moveaxis(self.values(observations)[-1], -1, 0)
         return result.reshape(len(result), -1)

@@ -1,4 +1,4 @@
-"""In which order the weights of a linear layer are written to C."""
+"""Orders the weights of a linear layer for C."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from sb3_sparse.export.ckernels import GROUP
 
 
 def grouped(rows: NDArray[Any]) -> tuple[list[int], NDArray[Any], NDArray[Any]]:
-    """Lengths, columns and values as the function ``linear`` reads them.
+    """Return lengths, columns and values in the order in which ``linear`` reads them.
 
-    Rows side by side are padded to the longest with zeros at a column that they have already.
+    Rows of a group are padded to the longest one with zeros, at a column that they already have.
     """
     lengths: list[int] = []
     columns: list[NDArray[Any]] = []
@@ -36,7 +36,7 @@ def grouped(rows: NDArray[Any]) -> tuple[list[int], NDArray[Any], NDArray[Any]]:
 
 
 def side_by_side(rows: NDArray[Any]) -> NDArray[Any]:
-    """Values of a dense layer as ``linear_dense`` reads them."""
+    """Return the values of a dense layer in the order in which ``linear_dense`` reads them."""
     together = len(rows) - len(rows) % GROUP
     groups = [rows[first : first + GROUP].T.reshape(-1) for first in range(0, together, GROUP)]
     return np.concatenate([*groups, rows[together:].reshape(-1)])

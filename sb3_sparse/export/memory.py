@@ -1,4 +1,4 @@
-"""Where the values of a graph lie in one static array, which as many as possible share."""
+"""Plans one static array for all values of a graph, which share it as far as possible."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from sb3_sparse.export.graph import Graph
 from sb3_sparse.export.nodes import Activation, Conv, Flatten, MaxPool, Node, PerUnit, Slice
 
 IN_PLACE = (Activation, PerUnit)
-"""Nodes that may write over their input."""
+"""Nodes that may overwrite their input."""
 
 
 @dataclass(frozen=True)
 class Memory:
-    """A plan.
+    """The layout of the array.
 
-    :param size: floats in the array
-    :param places: first float of each value that lies in the array, by its number
-    :param borders: first float of the bordered copy of a node's input, by the node's result
+    :param size: number of floats
+    :param places: index of the first float of each value in the array, by the value's number
+    :param borders: index of the first float of bordered copies of inputs, by the node's result
     """
 
     size: int
@@ -28,7 +28,7 @@ class Memory:
 
 
 def bordered_shape(node: Node, shape: tuple[int, ...]) -> tuple[int, ...] | None:
-    """Shape of the bordered copy of its input that a node needs; None if it needs none."""
+    """Return the shape of the bordered copy of its input that a node needs, or None."""
     if not isinstance(node, (Conv, MaxPool)) or not any(node.padding):
         return None
     units, *sizes = shape
@@ -36,13 +36,13 @@ def bordered_shape(node: Node, shape: tuple[int, ...]) -> tuple[int, ...] | None
 
 
 def plan_memory(graph: Graph) -> Memory:
-    """Place values first fit, each from the node that makes it to the last one that reads it.
+    """Place each value first-fit, from the node that makes it until the last one that reads it.
 
-    The observation and the action are the caller's and have no place.
+    The observation and the action belong to the caller and have no place.
     """
     last_value = len(graph.nodes)
     home = list(range(last_value + 1))
-    """The value in whose place a value lies."""
+    """The value whose place each value uses."""
     last_use = [0] * (last_value + 1)
     for value, node in enumerate(graph.nodes, start=1):
         before = node.inputs[0]
@@ -80,7 +80,7 @@ def plan_memory(graph: Graph) -> Memory:
 
 
 def _read_once(graph: Graph, value: int) -> bool:
-    """Whether one node alone reads a value, or what it is another view of."""
+    """Tell whether a single node reads a value, including the values that it is a view of."""
     while len(graph.users(value)) == 1:
         node = graph.nodes[value - 1]
         if not isinstance(node, Flatten):

@@ -18,8 +18,8 @@ Floats = NDArray[np.float32]
 class Node:
     """An operation.
 
-    :param inputs: values it takes: 0 is the observation, ``i`` the result of node ``i - 1``
-    :param shape: of its result for one observation: ``(units,)`` or ``(units, height, width)``
+    :param inputs: values that it reads: 0 is the observation, ``i`` the result of node ``i - 1``
+    :param shape: result for one observation: ``(units,)`` or ``(units, height, width)``
     """
 
     inputs: tuple[int, ...]
@@ -28,15 +28,15 @@ class Node:
 
     @property
     def name(self) -> str:
-        """What the NumPy loader calls it."""
+        """The NumPy loader's name of the operation."""
         return self.op
 
     def fields(self) -> dict[str, NDArray[Any]]:
-        """What the NumPy loader reads beside name and inputs; the last axis is the batch."""
+        """Return the arrays that the NumPy loader reads; the last axis is the batch."""
         return {}
 
     def run(self, *inputs: NDArray[Any]) -> NDArray[Any]:
-        """The result for a batch of inputs, whose last axis is the batch."""
+        """Compute the result for inputs whose last axis is the batch."""
         operation: Any = OPERATIONS[self.name]
         result: NDArray[Any] = operation(self.fields(), *inputs)
         return result
@@ -44,9 +44,9 @@ class Node:
 
 @dataclass(frozen=True, eq=False)
 class Normalize(Node):
-    """``clip((x - mean) * scale)``, the mean in two floats: it may be far larger than ``x - mean``.
+    """``clip((x - mean) * scale)``; two floats hold each mean, which may far exceed ``x - mean``.
 
-    :param mean: float64, of the input's shape
+    :param mean: float64, shape of the input
     :param scale: float64, one over the standard deviation
     :param clip: largest absolute value
     """
@@ -68,7 +68,7 @@ class Normalize(Node):
 
 @dataclass(frozen=True, eq=False)
 class PerUnit(Node):
-    """Does with each unit what its own numbers say: all fields have shape ``(units,)``."""
+    """An operation with its own numbers for each unit; all fields have shape ``(units,)``."""
 
     names: ClassVar[tuple[str, ...]]
 
@@ -89,7 +89,7 @@ class Affine(PerUnit):
 
 @dataclass(frozen=True, eq=False)
 class Clip(PerUnit):
-    """Between ``low`` and ``high``."""
+    """``x`` clipped to ``[low, high]``."""
 
     low: Floats
     high: Floats
@@ -99,7 +99,7 @@ class Clip(PerUnit):
 
 @dataclass(frozen=True, eq=False)
 class Slopes(PerUnit):
-    """``x * slope`` where ``x`` is negative, as the PReLU with a slope for each unit."""
+    """``x * slope`` for negative ``x``, else ``x``: a PReLU with a slope for each unit."""
 
     slope: Floats
     op = "slopes"
@@ -112,10 +112,10 @@ class Slopes(PerUnit):
 
 @dataclass(frozen=True, eq=False)
 class Activation(Node):
-    """A function of one number, element by element.
+    """An elementwise function.
 
-    :param kind: which, among the NumPy loader's
-    :param parameters: by name
+    :param kind: the NumPy loader's name of the function
+    :param parameters: the function's parameters by name
     """
 
     kind: str
@@ -134,8 +134,8 @@ class Activation(Node):
 class Weighted(Node):
     """A layer with connections.
 
-    :param weight: of shape ``(outputs, inputs)`` or ``(outputs, inputs, height, width)``
-    :param bias: of shape ``(outputs,)``
+    :param weight: shape ``(outputs, inputs)`` or ``(outputs, inputs, height, width)``
+    :param bias: shape ``(outputs,)``
     """
 
     weight: Floats
@@ -143,12 +143,12 @@ class Weighted(Node):
 
     @property
     def rows(self) -> Floats:
-        """The weight, a row for each output."""
+        """The weight with a row for each output."""
         return self.weight.reshape(len(self.weight), -1)
 
     @property
     def nnz(self) -> int:
-        """Connections that are not 0."""
+        """Number of connections that are not 0."""
         return int(np.count_nonzero(self.weight))
 
     def fields(self) -> dict[str, NDArray[Any]]:
@@ -164,10 +164,10 @@ class Linear(Weighted):
 
 @dataclass(frozen=True, eq=False)
 class Conv(Weighted):
-    """A convolution over height and width, zeros around.
+    """A convolution over height and width, padded with zeros.
 
-    :param stride: steps down and right
-    :param padding: zeros above and below, left and right
+    :param stride: vertical and horizontal steps
+    :param padding: vertical and horizontal padding on each side
     """
 
     stride: tuple[int, int]
@@ -198,7 +198,7 @@ class MaxPool(Node):
 
 @dataclass(frozen=True, eq=False)
 class Flatten(Node):
-    """All units in one row."""
+    """All units and places as one vector."""
 
     op = "flatten"
 
@@ -219,14 +219,14 @@ class Multiply(Node):
 
 @dataclass(frozen=True, eq=False)
 class Concat(Node):
-    """Values behind each other."""
+    """The concatenation of values along the units."""
 
     op = "concat"
 
 
 @dataclass(frozen=True, eq=False)
 class Standardize(Node):
-    """All units less their mean, by their standard deviation, as layer normalisation does.
+    """All units minus their mean, divided by their standard deviation: layer normalisation.
 
     :param eps: added to the variance
     """
@@ -242,7 +242,7 @@ class Standardize(Node):
 class Slice(Node):
     """A part of the observation.
 
-    :param start: its first number
+    :param start: index of the part's first element
     """
 
     start: int
@@ -255,9 +255,9 @@ class Slice(Node):
 
 @dataclass(frozen=True, eq=False)
 class OneHot(Node):
-    """For each whole number as many units as it has values, all 0 but that of its value, 1.
+    """One-hot encodings of whole numbers, concatenated.
 
-    :param sizes: values of each number
+    :param sizes: number of values of each number
     """
 
     sizes: tuple[int, ...]
@@ -270,9 +270,9 @@ class OneHot(Node):
 
 @dataclass(frozen=True, eq=False)
 class Argmax(Node):
-    """The index of the largest in each group of consecutive units, the first of equals.
+    """The index of the largest unit in each group of consecutive units; the first among equals.
 
-    :param sizes: units of each group
+    :param sizes: number of units of each group
     """
 
     sizes: tuple[int, ...]
@@ -284,6 +284,6 @@ class Argmax(Node):
 
 @dataclass(frozen=True, eq=False)
 class Positive(Node):
-    """1 where positive, else 0."""
+    """1 for positive units, 0 for others."""
 
     op = "positive"

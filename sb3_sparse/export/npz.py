@@ -1,4 +1,4 @@
-"""A policy as one .npz file without pickles, for the loader in ``numpy_policy.py``."""
+"""Writes a policy as an .npz file without pickles, for the loader in ``numpy_policy.py``."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from sb3_sparse.export.nodes import Node, Weighted
 
 
 def write_npz(graph: Graph) -> bytes:
-    """Bytes of the file: all nodes' names and inputs, and each one's ``<number>.<array>``."""
+    """Return the bytes of the file: names and inputs of all nodes, and their arrays."""
     most = max(len(node.inputs) for node in graph.nodes)
     inputs = np.zeros((len(graph.nodes), most), np.int32)
     for row, node in zip(inputs, graph.nodes, strict=True):
@@ -35,7 +35,7 @@ def write_npz(graph: Graph) -> bytes:
 
 
 def _fields(node: Node) -> dict[str, NDArray[Any]]:
-    """A node's arrays, its weight in compressed rows where that is smaller."""
+    """Return a node's arrays, with the weight as compressed rows if that is smaller."""
     fields = node.fields()
     if not isinstance(node, Weighted):
         return fields

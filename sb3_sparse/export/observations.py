@@ -1,4 +1,4 @@
-"""Observations that an export is checked on."""
+"""Observations for checking an export."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_no
 from sb3_sparse.errors import ConfigError
 
 Observations = Any
-"""An array of observations, one a row, or a dict of such arrays."""
+"""An array with an observation per row, or a dict of such arrays."""
 WIDE = 3.0
-"""Standard deviations of random observations where nothing bounds them."""
+"""Width of random observations without bounds, in standard deviations."""
 FAR = 1e6
-"""A bound beyond this is none."""
+"""Bounds beyond this are ignored."""
 
 
 def random_observations(
     space: spaces.Space[Any], normalization: VecNormalize | None, count: int
 ) -> Observations:
-    """Raw observations of every kind that a space allows.
+    """Draw raw observations from a space.
 
-    Uniform where the space has bounds; else normal, three times as wide as what was seen, or as 1
-    where nothing is known.
+    Elements are uniform if they have bounds. Others are normal, with three times the standard
+    deviation of ``normalization``, or 3 without one.
 
-    :param space: what the policy sees
-    :param normalization: what normalises its observations
+    :param space: the policy's observation space
+    :param normalization: what normalises the observations
     """
     rms = None if normalization is None else normalization.obs_rms
     return _random(space, rms, count, np.random.default_rng(0))
@@ -63,21 +63,21 @@ def _random(space: Any, rms: Any, count: int, generator: np.random.Generator) ->
 
 
 def record_observations(model: BaseAlgorithm, env: VecEnv, count: int) -> Observations:
-    """Raw observations that a model meets in an environment, acting deterministically.
+    """Record the raw observations that a model meets while it acts deterministically.
 
-    Where frames are stacked after they were normalised there are no raw observations of the
-    policy's shape; these are then what the policy sees.
+    If frames are stacked after normalisation, there are no raw observations of the policy's shape,
+    and what the policy sees is recorded instead.
 
-    :param env: with the model's own wrappers, normalised or not; its statistics stay as they are
-    :param count: how many
-    :raises ConfigError: if the environment shows other observations than the model takes, or takes
-        other actions
+    :param env: an environment with the model's wrappers, normalised or not; its statistics do not
+        change
+    :param count: number of observations
+    :raises ConfigError: if the environment does not fit the model's observations or actions
     """
     if not _fits(env.observation_space, model.observation_space):
-        shown, taken = _said(env.observation_space, model.observation_space)
+        shown, taken = _described(env.observation_space, model.observation_space)
         raise ConfigError(
             f"the environment shows observations {shown}, the model takes {taken}; a "
-            "run's folder tells which wrappers and stacked frames belong to it, a zip does not"
+            "run's folder knows the wrappers and stacked frames that belong to it, a zip does not"
         )
     there, here = env.action_space, model.action_space
     if type(there) is not type(here) or (
@@ -111,7 +111,7 @@ def record_observations(model: BaseAlgorithm, env: VecEnv, count: int) -> Observ
 
 
 def _fits(shown: Any, taken: Any) -> bool:
-    """Whether a policy takes what an environment shows; images may have their channels last."""
+    """Tell whether a policy takes an environment's observations; images may be channels last."""
     if isinstance(taken, spaces.Dict):
         return (
             isinstance(shown, spaces.Dict)
@@ -123,8 +123,8 @@ def _fits(shown: Any, taken: Any) -> bool:
     return bool(shown == taken)
 
 
-def _said(shown: Any, taken: Any) -> tuple[str, str]:
-    """How to call what differs between two spaces."""
+def _described(shown: Any, taken: Any) -> tuple[str, str]:
+    """Describe the difference between two spaces."""
     if isinstance(shown, spaces.Box) and isinstance(taken, spaces.Box):
         return f"of shape {shown.shape}", f"{taken.shape}"
     return f"in {shown}", f"those in {taken}"
@@ -140,9 +140,9 @@ def _raw(normalization: VecNormalize, seen: Observations) -> Observations:
 
 
 def check_recorded(observations: Observations, space: spaces.Space[Any]) -> None:
-    """Refuse recorded observations that are not finite, or not of the policy's shape.
+    """Reject recorded observations that are not finite or do not have the policy's shape.
 
-    :raises ConfigError: if so
+    :raises ConfigError: if they are not valid
     """
     if not isinstance(space, spaces.Dict):
         _check_part(observations, space, "recorded observations")
@@ -174,9 +174,9 @@ def _check_part(part: Any, space: spaces.Space[Any], what: str) -> None:
 
 
 def check_statistics(space: spaces.Space[Any], normalization: VecNormalize) -> None:
-    """Refuse statistics of other observations than the policy takes.
+    """Reject statistics of observations that the policy does not take.
 
-    :raises ConfigError: if so
+    :raises ConfigError: if they do not fit
     """
     rms: Any = normalization.obs_rms
     parts = space.spaces if isinstance(space, spaces.Dict) else None
@@ -193,18 +193,18 @@ def check_statistics(space: spaces.Space[Any], normalization: VecNormalize) -> N
         raise ConfigError(
             f"the statistics are of {seen}, the policy takes {taken}. Give those of the same "
             "run; if its frames were stacked after normalisation, it can be exported as 'dense' "
-            "only, since no raw observation stands for the empty frames of a beginning"
+            "only, since no raw observation stands for the empty frames of a new episode"
         )
 
 
 def has_images(space: spaces.Space[Any]) -> bool:
-    """Whether a space is one of images, or has one in it."""
+    """Tell whether a space consists of images or contains some."""
     parts = space.spaces.values() if isinstance(space, spaces.Dict) else [space]
     return any(is_image_space(part) for part in parts)
 
 
 def count_of(observations: Observations | None) -> int:
-    """How many observations there are."""
+    """Return the number of observations; 0 for None."""
     if observations is None:
         return 0
     if isinstance(observations, dict):
@@ -213,14 +213,14 @@ def count_of(observations: Observations | None) -> int:
 
 
 def row_of(observations: Observations, number: int) -> Observations:
-    """One of the observations, by itself."""
+    """Return one observation, without the batch axis."""
     if isinstance(observations, dict):
         return {key: part[number] for key, part in observations.items()}
     return observations[number]
 
 
 def rows_of(observations: Observations, first: int, last: int) -> Observations:
-    """Some of the observations."""
+    """Return a slice of the observations."""
     if isinstance(observations, dict):
         return {key: part[first:last] for key, part in observations.items()}
     return observations[first:last]

@@ -1,4 +1,4 @@
-"""Pickles that do not tell where the code of their functions lay."""
+"""Pickles that do not contain the paths of source files."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import cloudpickle
 
 
 def pickled(value: Any) -> bytes:
-    """Pickle a value as SB3 does, functions by value too, without the paths of their files."""
+    """Pickle a value as SB3 does, functions by value included, without paths of source files."""
     file = io.BytesIO()
     _Pickler(file).dump(value)
     return file.getvalue()
@@ -26,7 +26,7 @@ class _Pickler(cloudpickle.Pickler):  # type: ignore[misc]
 
 
 def _importable(function: FunctionType) -> bool:
-    """Whether a function is pickled by its name alone."""
+    """Tell whether a function is pickled by name."""
     found: Any = sys.modules.get(function.__module__)
     if found is None or function.__module__ == "__main__":
         return False

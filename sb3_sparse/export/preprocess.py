@@ -1,4 +1,4 @@
-"""What an SB3 policy does to an observation before its features extractor sees it."""
+"""Translates what SB3 does to an observation before the features extractor."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from sb3_sparse.export.trace import Tracer
 
 @dataclass(frozen=True)
 class Observed:
-    """What an exported policy takes.
+    """The input of an exported policy.
 
-    :param shape: of one observation; a dict is one row, its parts behind each other
-    :param pixels: whether it is an image of uint8
-    :param parts: of a dict
+    :param shape: shape of one observation; a dict is one row that concatenates its parts
+    :param pixels: whether it is a uint8 image
+    :param parts: the parts of a dict
     """
 
     shape: tuple[int, ...]
@@ -33,9 +33,9 @@ class Observed:
 
 
 def observed(space: spaces.Space[Any]) -> Observed:
-    """What an exported policy of a space takes.
+    """Return the input of a policy with this observation space.
 
-    :raises UnsupportedError: for a space whose observations are not rows of numbers
+    :raises UnsupportedError: if observations of the space are not numbers
     """
     if isinstance(space, spaces.Dict):
         parts = tuple(
@@ -51,7 +51,7 @@ def preprocessed(
     normalization: VecNormalize | None,
     normalize_images: bool,
 ) -> int | Mapping[str, int]:
-    """The value that the features extractor gets; of a dict one for each key.
+    """Return the input of the features extractor, or one for each key of a dict.
 
     :param normalization: what normalises observations before the policy sees them
     :param normalize_images: whether the policy divides pixels by 255

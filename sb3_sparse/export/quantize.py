@@ -1,4 +1,4 @@
-"""Weights as 8-bit whole numbers."""
+"""Rounds weights to 8-bit whole numbers."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from sb3_sparse.export.nodes import Floats, Weighted
 
 LARGEST = 127
 SMALLEST = 1e-30
-"""A row of weights below this is 0; its scale would have no digits left."""
+"""Rows whose weights are all smaller become 0, since their scale would underflow."""
 
 
 def quantize_rows(rows: NDArray[Any]) -> tuple[NDArray[np.int8], Floats]:
-    """Nearest whole numbers in [-127, 127] and the scale of each row: ``rows ~ numbers * scale``.
+    """Return whole numbers in [-127, 127] and a scale per row: ``rows ~ numbers * scale``.
 
-    :param rows: weights, a row for each output
+    :param rows: weights with a row for each output
     """
     most = np.abs(rows).max(axis=1, initial=0.0)
     scale = (np.where(most > SMALLEST, most, 1.0) / LARGEST).astype(np.float32)
@@ -27,7 +27,7 @@ def quantize_rows(rows: NDArray[Any]) -> tuple[NDArray[np.int8], Floats]:
 
 
 def quantized(graph: Graph) -> Graph:
-    """The graph with the weights that 8 bits leave of it."""
+    """Return the graph with weights rounded to 8 bits."""
     return replace(graph, nodes=tuple(_rounded(node) for node in graph.nodes))
 
 

@@ -1,4 +1,4 @@
-"""Lossless changes of units: dead ones removed, others put in order."""
+"""Removes and reorders units without changing the function."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ from sb3_sparse.export.nodes import (
 )
 
 UNIT_BY_UNIT = (Activation, PerUnit, Flatten, MaxPool, Normalize)
-"""Nodes whose result has the units of their input."""
+"""Nodes whose result has the same units as their input."""
 
 
 def remove_dead_units(graph: Graph) -> Graph:
-    """The same function with fewer units.
+    """Remove units that are constant or unread.
 
     A unit without active inputs, or with constant ones only, has a constant value, which is added
-    to the biases of the layers that read it. A unit that nothing reads is dropped, with its
+    to the biases of the layers that read it. A unit that nothing reads is removed together with its
     connections. Observations, actions and the ends of residual connections keep all their units.
     """
     constants = _Constants(graph)
@@ -47,9 +47,9 @@ def remove_dead_units(graph: Graph) -> Graph:
 
 
 def sort_units(graph: Graph) -> Graph:
-    """The same function with the units of every hidden linear layer in the order of their inputs.
+    """Sort the units of every hidden linear layer by their number of inputs.
 
-    Neighbouring rows then have about as many connections, which fast code can use.
+    Neighbouring rows then have similar numbers of connections, as fast code needs.
     """
     constants = _Constants(graph)
     order = {
@@ -61,10 +61,9 @@ def sort_units(graph: Graph) -> Graph:
 
 
 def select_units(graph: Graph, chosen: Mapping[int, NDArray[np.intp]]) -> Graph:
-    """A graph with some units left out, or in another order.
+    """Remove or reorder units of a graph.
 
-    :param chosen: indices of the units of a layer's result, by number of the value; all others
-        keep theirs
+    :param chosen: indices of the remaining units by number of the value; other values are unchanged
     """
     units = [np.arange(graph.observation_shape[0])]
     nodes: list[Node] = []
@@ -94,15 +93,15 @@ def select_units(graph: Graph, chosen: Mapping[int, NDArray[np.intp]]) -> Graph:
 
 
 def units_of(graph: Graph) -> int:
-    """Units of all layers: outputs of linear layers, channels of convolutions."""
+    """Count the units of all layers: outputs of linear layers, channels of convolutions."""
     return sum(len(layer.bias) for layer in graph.layers)
 
 
 class _Constants:
-    """What is constant in a graph.
+    """The constant units of a graph.
 
-    ``known[v]`` has the constant of each unit of value ``v``, NaN where there is none;
-    ``pinned[v]`` is true for units that must stay though they are constant.
+    ``known[v]`` is the constant of each unit of value ``v``, NaN for units that vary;
+    ``pinned[v]`` is true for units that must stay even if they are constant.
     """
 
     def __init__(self, graph: Graph) -> None:
@@ -110,7 +109,7 @@ class _Constants:
         self.known = [np.full(count, np.nan) for count in units]
         self.pinned = [np.zeros(count, bool) for count in units]
         self.source = list(range(len(units)))
-        """The value whose units a value has."""
+        """The value that each value shares its units with."""
         for number, node in enumerate(graph.nodes):
             value = number + 1
             if isinstance(node, UNIT_BY_UNIT):
@@ -136,18 +135,18 @@ class _Constants:
             self.pinned[self.source[value]][:] = True
 
     def _of_layer(self, layer: Weighted) -> NDArray[np.float64]:
-        """Constants of a layer's outputs; pins the inputs that cannot be folded into its bias."""
+        """Return constants of a layer's outputs, and pin inputs that its bias cannot absorb."""
         (value,) = layer.inputs
         known = self.known[value]
         if isinstance(layer, Conv) and any(layer.padding):
-            self.pinned[self.source[value]] |= known > 0  # at the border they meet zeros
+            self.pinned[self.source[value]] |= known > 0  # at the border they alternate with zeros
             self.pinned[self.source[value]] |= known < 0
         foldable = self.foldable(layer)
         moving = _connected(layer)[:, ~foldable].any(axis=1)
         return np.where(moving, np.nan, self.bias(layer))
 
     def foldable(self, layer: Weighted) -> NDArray[np.bool_]:
-        """Inputs of a layer that are constant everywhere it looks."""
+        """Tell which inputs of a layer are constant at every place it reads."""
         known = self.known[layer.inputs[0]]
         if isinstance(layer, Conv) and any(layer.padding):
             constant: NDArray[np.bool_] = known == 0
@@ -156,7 +155,7 @@ class _Constants:
         return constant
 
     def bias(self, layer: Weighted) -> NDArray[np.float64]:
-        """A layer's bias with its constant inputs in it."""
+        """Return a layer's bias plus the contribution of its constant inputs."""
         foldable = self.foldable(layer)
         columns = layer.weight.astype(np.float64).reshape(len(layer.weight), foldable.size, -1)
         total: NDArray[np.float64] = (
@@ -166,14 +165,14 @@ class _Constants:
 
 
 def _connected(layer: Weighted) -> NDArray[np.bool_]:
-    """Whether output and input have a connection, shape ``(outputs, inputs)``."""
+    """Tell which outputs and inputs are connected, shape ``(outputs, inputs)``."""
     weight = layer.weight.reshape(*layer.weight.shape[:2], -1)
     connected: NDArray[np.bool_] = (weight != 0).any(axis=2)
     return connected
 
 
 def _kept_units(graph: Graph, constants: _Constants) -> dict[int, NDArray[np.intp]]:
-    """Which units of each layer stay."""
+    """Return the indices of the units of each layer that stay."""
     read = [pinned.copy() for pinned in constants.pinned]
     for number in reversed(range(len(graph.nodes))):
         node, result = graph.nodes[number], read[number + 1]
@@ -195,7 +194,7 @@ def _kept_units(graph: Graph, constants: _Constants) -> dict[int, NDArray[np.int
 
 
 def _without_constants(layer: Weighted, value: int, constants: _Constants) -> Weighted:
-    """A layer with its constant inputs in its bias."""
+    """Move a layer's constant inputs into its bias."""
     weight = layer.weight.copy()
     weight[:, constants.foldable(layer)] = 0.0
     weight[~np.isnan(constants.known[value])] = 0.0

@@ -120,7 +120,7 @@ def export_policy(
     :raises ConfigError: for a value that is not allowed
     :raises UnsupportedError: for an algorithm, network or space that cannot be exported, or if
         there is no C compiler for the check
-    :raises CorruptStateError: if weights and masks contradict each other
+    :raises CorruptStateError: if the file given as ``vecnormalize`` is damaged
     :raises Diverged: if weights are not finite
     :raises ParityError: if the export does not act as the model: if continuous actions differ by
         more than 1e-5, relative to their size above 1 and to the range they are squashed into, or
