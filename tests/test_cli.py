@@ -232,7 +232,10 @@ def test_a_missing_extra_of_a_run_names_its_cure_in_one_line(missing, args, cure
 
 def test_inspect_of_what_is_no_model(tmp_path, mistake):
     (tmp_path / "notes.zip").write_text("no zip at all")
-    for name, message in (("gone.zip", "there is no file"), ("notes.zip", "is no model saved by")):
+    for name, message in (
+        ("gone.zip", "there is no file"),
+        ("notes.zip", "holds no model saved"),
+    ):
         assert message in mistake("inspect", name)
 
 

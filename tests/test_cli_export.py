@@ -147,7 +147,7 @@ def test_a_zip_alone(monkeypatch, capsys, tmp_path):
             "shows observations of shape (3,), the model takes",
         ),
         (["model.zip", "--env", "TinyImages-v0"], "observations of shape (36, 36, 1), the model"),
-        (["broken.zip"], "is no model saved by SB3"),
+        (["broken.zip"], "holds no model saved by SB3"),
         (["masks.zip"], "masks and weights disagree"),
         (["."], "there is no run in"),
     ],

@@ -41,11 +41,11 @@ def test_a_study_of_ones_own_is_run_looked_at_and_reported(tmp_path):
     done = call("study", "run", *which, "--workers", "2", cwd=tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "2 of 2 runs are done" in done.stdout
-    assert "Draw them: sb3-sparse study report mine.yml --scale smoke" in done.stdout
+    assert "Report on them with: sb3-sparse study report mine.yml --scale smoke" in done.stdout
     assert len(list((tmp_path / "studies/runs/dqn").iterdir())) == 2
 
     again = call("study", "run", *which, cwd=tmp_path)
-    assert "2 of 2 runs are done already" in again.stdout
+    assert "2 of 2 runs are already done" in again.stdout
     assert "left" not in again.stdout  # nothing was run
 
     report = call("study", "report", *which, cwd=tmp_path)
@@ -65,7 +65,7 @@ def test_an_unknown_figure_is_known_before_anything_is_run(tmp_path, mistake):
 
 def test_a_report_of_nothing_is_a_mistake_and_makes_nothing(tmp_path, mistake):
     said = mistake("study", "report", "flops", "--folder", "elsewhere")
-    assert "there is no run of this study in elsewhere yet; begin with: sb3-sparse study" in said
+    assert "there is no run of this study in elsewhere yet; start with: sb3-sparse study" in said
     assert not (tmp_path / "elsewhere").exists()
 
 

@@ -31,7 +31,7 @@ def enjoy_command(
     vecnormalize: Statistics = None,
     gym_packages: GymPackages = None,
 ) -> None:
-    """Evaluate a saved policy, and record a video of it."""
+    """Evaluate a saved policy, and optionally record a video."""
     from sb3_sparse.cli.progress.train import EpisodesProgress
     from sb3_sparse.zoo.scoring import enjoy
 

@@ -33,17 +33,17 @@ Scale = Annotated[
 Archive = Annotated[
     Path | None,
     option(
-        "JSON-lines file of cells that are over, to be committed; they count as done.",
+        "JSON-lines file of finished cells, to be committed; they count as done.",
         "--archive",
         shown=False,
     ),
 ]
-Store = Annotated[Path, option("Where runs and reports go; studies share it.", "--folder", "-f")]
+Store = Annotated[Path, option("Folder of runs and reports, shared by studies.", "--folder", "-f")]
 
 
 @studies.command("list")
 def list_() -> None:
-    """Every study that comes with the package."""
+    """List the studies that come with the package."""
     from sb3_sparse.studies.blocks import SCALES, planned_runs, study_names, title_of
 
     table = Table("study", "what", *SCALES, box=None, header_style="bold")
@@ -51,21 +51,21 @@ def list_() -> None:
         runs = planned_runs(name)
         table.add_row(name, title_of(name), *(str(runs.get(scale, "")) for scale in SCALES))
     console.print(table)
-    say("Numbers are runs. Go on with: sb3-sparse study run NAME --scale SCALE")
+    say("Numbers are runs. Start a study with: sb3-sparse study run NAME --scale SCALE")
 
 
 @studies.command()
 def run(
     name: Name,
     scale: Scale = "small",
-    workers: Annotated[int, option("Runs at once, each a process of one thread.")] = 1,
+    workers: Annotated[int, option("Simultaneous runs, each in a process of one thread.")] = 1,
     launcher: Launcher = "local",
     address: Address = None,
     store: Store = Path("studies"),
     archive: Archive = None,
     gym_packages: GymPackages = None,
 ) -> None:
-    """Train what a study lacks. What is done stays done; the same command goes on."""
+    """Train the missing runs of a study. Give the same command again to resume it."""
     asked = _Asked(name, scale, store, archive, gym_packages or [])
     chosen = launcher_named(launcher, address)
     study = asked.study()
@@ -81,16 +81,16 @@ def run(
         for last in runner:
             shown(last)
     except KeyboardInterrupt:
-        say("Stopping; what is running is kept up to its last checkpoint ...")
+        say("Stopping; running cells are kept up to their last checkpoint ...")
         runner.close()
         more = ["--workers", str(workers)] if workers > 1 else []
-        say(f"Go on with: {asked.command('run', *more)}")
+        say(f"Resume with: {asked.command('run', *more)}")
         raise typer.Exit(INTERRUPTED) from None
     finally:
         shown.close()
     assert last is not None
     if last.elsewhere:
-        say(f"{last.elsewhere} runs are trained by other processes; look again with:")
+        say(f"{last.elsewhere} runs are being trained by other processes; check again with:")
         say(asked.command("status"))
     alike: dict[str, list[str]] = {}
     for failed, error in last.failed.items():
@@ -102,7 +102,7 @@ def run(
     if last.diverged:
         say(f"Diverged, and not run again: {last.diverged}; the report names them.")
     if last.done or last.diverged:
-        say(f"Draw them: {asked.command('report')}")
+        say(f"Report on them with: {asked.command('report')}")
     if last.failed:
         raise typer.Exit(1)
 
@@ -115,7 +115,7 @@ def status(
     archive: Archive = None,
     gym_packages: GymPackages = None,
 ) -> None:
-    """How far a study is, and which of its runs failed."""
+    """Show the progress of a study, and which of its runs failed."""
     asked = _Asked(name, scale, store, archive, gym_packages or [])
     study = asked.study()
     from sb3_sparse.studies.status import FAILED, RUNNING, STOPPED, counts
@@ -150,7 +150,7 @@ def report(
     ] = None,
     gym_packages: GymPackages = None,
 ) -> None:
-    """Figures, tables and verdicts of what is done, as one page that opens from disk."""
+    """Write figures, tables and verdicts of the finished runs as one HTML page."""
     asked = _Asked(name, scale, store, archive, gym_packages or [])
     study = asked.study()
     from sb3_sparse.report import write_report
@@ -161,7 +161,7 @@ def report(
     if not folders and not archived:
         where = store if archive is None else f"{store} or {archive}"
         raise ConfigError(
-            f"there is no run of this study in {where} yet; begin with: {asked.command('run')}"
+            f"there is no run of this study in {where} yet; start with: {asked.command('run')}"
         )
     page = write_report(
         folders,
@@ -179,11 +179,11 @@ def report(
 def _say_merged(study: Study) -> None:
     if study.merged:
         names = "; ".join(study.merged)
-        say(f"note: in the file more than once, and trained once: {names}")
+        say(f"note: listed more than once, but trained once: {names}")
 
 
 def _check_figures(study: Study) -> None:
-    """An unknown figure is better known before the runs; without the extra it is told after."""
+    """Reject unknown figures before the runs, if the extra for reports is installed."""
     try:
         from sb3_sparse.report.figures import check_figures
     except MissingExtra:
@@ -199,7 +199,7 @@ def _pending(one: CellStatus, store: Path) -> str:
 
 @dataclass(frozen=True)
 class _Asked:
-    """What was asked for on the command line."""
+    """The arguments that the commands of a study share."""
 
     name: str
     scale: str
@@ -218,7 +218,7 @@ class _Asked:
         return [status_of(cell, self.store, lines) for cell in study.cells]
 
     def command(self, what: str, *more: str) -> str:
-        """The same for another command."""
+        """Return another command with the same arguments."""
         words = ["study", what, self.name, "--scale", self.scale]
         if self.store != Path("studies"):
             words += ["--folder", str(self.store)]

@@ -1,1 +1,1 @@
-"""Reading what was saved: every file is named in the error when it cannot be read."""
+"""Read saved files; every error names the file that cannot be read."""

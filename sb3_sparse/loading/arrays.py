@@ -1,4 +1,4 @@
-"""NumPy archives."""
+"""Reads NumPy archives."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from sb3_sparse.loading.guard import reading
 def read_arrays(
     path: Path, what: str, cure: str, needed: Sequence[str] = ()
 ) -> dict[str, NDArray[Any]]:
-    """All arrays in an ``.npz`` file, by name. Nothing is unpickled.
+    """Read all arrays in an ``.npz`` file by name. Nothing is unpickled.
 
-    :param what: as of :func:`~sb3_sparse.loading.guard.reading`
-    :param cure: as of :func:`~sb3_sparse.loading.guard.reading`
-    :param needed: arrays that must be among them, of numbers or truth values
-    :raises ConfigError: if it cannot be opened
-    :raises CorruptStateError: if it holds something else
+    :param what: see :func:`~sb3_sparse.loading.guard.reading`
+    :param cure: see :func:`~sb3_sparse.loading.guard.reading`
+    :param needed: names of arrays of numbers or booleans that the file must hold
+    :raises ConfigError: if the file cannot be opened
+    :raises CorruptStateError: if the file holds something else
     """
     with reading(path, what, cure):
         content = np.load(path, allow_pickle=False)
         if not isinstance(content, np.lib.npyio.NpzFile):
-            raise CorruptStateError(f"{path} is damaged, or is no {what}: no archive; {cure}")
+            raise CorruptStateError(f"{path} is damaged, or holds no {what}: no archive; {cure}")
         with content:
             arrays = {name: np.asanyarray(content[name]) for name in content.files}
     for name in needed:

@@ -1,4 +1,4 @@
-"""Whatever goes wrong while a file is read is said of the file."""
+"""Turns errors while a file is read into errors that name the file."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from sb3_sparse.errors import ConfigError, CorruptStateError, SparsityError, Uns
 
 @contextmanager
 def reading(path: Path, what: str, cure: str) -> Iterator[None]:
-    """Within it, every error of a library that reads the file becomes one of ours.
+    """Turn every error of a library that reads the file into one of this package.
 
-    Damaged bytes make a parser raise anything at all, so all of it is caught. Keep the block to the
-    reading itself: our own mistakes must still show a traceback.
+    Damaged bytes make a parser raise anything at all, so everything is caught. Keep the block to
+    the reading itself: bugs of this package must still show a traceback.
 
-    :param path: of the file
-    :param what: it should hold, e.g. ``"record of a run"``
+    :param path: the file
+    :param what: what the file should hold, e.g. ``"record of a run"``
     :param cure: what to do if it does not
-    :raises ConfigError: if it cannot be opened, or needs code that is not here
-    :raises CorruptStateError: if its content is not what it should be
+    :raises ConfigError: if the file cannot be opened, or needs code that is not installed
+    :raises CorruptStateError: if the file holds something else
     """
     try:
         yield
@@ -36,8 +36,8 @@ def reading(path: Path, what: str, cure: str) -> Iterator[None]:
         raise ConfigError(f"{path} cannot be read: {error.strerror}; {cure}") from error
     except ModuleNotFoundError as error:
         raise ConfigError(
-            f"{path} needs the module {error.name!r}, which cannot be imported here; install it, "
-            "or run the command where it lies. If the model has no code of its own, the file is "
+            f"{path} needs the module {error.name!r}, which cannot be imported; install it, "
+            "or run the command in its folder. If the model has no code of its own, the file is "
             f"damaged: {cure}"
         ) from error
     except MemoryError as error:
@@ -46,12 +46,12 @@ def reading(path: Path, what: str, cure: str) -> Iterator[None]:
         ) from error
     except Exception as error:
         raise CorruptStateError(
-            f"{path} is damaged, or is no {what} ({reason(error)}); {cure}"
+            f"{path} is damaged, or holds no {what} ({reason(error)}); {cure}"
         ) from error
 
 
 def reason(error: BaseException) -> str:
-    """What an error says, in a line of readable length."""
+    """Return an error's message as a line of readable length."""
     text = " ".join(str(error).split())
     text = "".join(c if c.isprintable() else "�" for c in text)
     name = type(error).__name__

@@ -1,4 +1,4 @@
-"""What a VecNormalize has seen, as ``VecNormalize.save`` wrote it."""
+"""Reads the statistics that ``VecNormalize.save`` wrote."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ CURE = "give what VecNormalize.save wrote of the same run, e.g. --vecnormalize v
 
 
 def read_statistics(path: Path) -> VecNormalize:
-    """The VecNormalize in a file; it has no environments yet.
+    """Read the VecNormalize in a file; it has no environments yet.
 
-    Unpickles the file, as SB3 does: it must come from somebody who is trusted.
+    This unpickles the file, as SB3 does, so the file must be trusted.
 
-    :raises ConfigError: if it cannot be opened
-    :raises CorruptStateError: if it holds something else
+    :raises ConfigError: if the file cannot be opened
+    :raises CorruptStateError: if the file holds something else
     :raises Diverged: if a mean or variance is not finite
     """
     with reading(path, WHAT, CURE):
@@ -37,22 +37,22 @@ def read_statistics(path: Path) -> VecNormalize:
         parts = _parts(found)
         for one in parts.values():
             if one.mean.dtype.kind != "f" or one.mean.shape != one.var.shape:
-                raise CorruptStateError(f"{path} is damaged: its mean does not suit its variance")
+                raise CorruptStateError(f"{path} is damaged: its mean does not match its variance")
         bool(found.norm_obs), bool(found.norm_reward)
         float(found.epsilon), float(found.clip_obs)
         finite = all(np.isfinite([*one.mean.flat, *one.var.flat]).all() for one in parts.values())
     if not finite:
         raise Diverged(
             f"the statistics in {path} are not finite: the environment showed NaN or infinite "
-            "observations in training. Mend the environment and train anew"
+            "observations in training. Fix the environment and train again"
         )
     return found
 
 
 def load_statistics(path: Path, envs: VecEnv) -> VecNormalize:
-    """Environments that are normalised as a file says.
+    """Normalise environments by the statistics in a file.
 
-    :raises ConfigError: as :func:`read_statistics`, or if it is of other observations
+    :raises ConfigError: as :func:`read_statistics`, or if the observations do not match
     """
     found = read_statistics(path)
     space = envs.observation_space
@@ -63,7 +63,7 @@ def load_statistics(path: Path, envs: VecEnv) -> VecNormalize:
     fits = all(shown.get(key) == shape for key, shape in seen.items())
     if found.norm_obs and not (fits and seen):
         raise ConfigError(
-            f"the statistics in {path} are of observations of shape "
+            f"the statistics in {path} are for observations of shape "
             f"{', '.join(map(str, seen.values())) or 'unknown'}, the environment shows "
             f"{', '.join(map(str, shown.values()))}; {CURE}"
         )
@@ -73,7 +73,7 @@ def load_statistics(path: Path, envs: VecEnv) -> VecNormalize:
 
 
 def _parts(normalize: VecNormalize) -> dict[str, RunningMeanStd]:
-    """Statistics of the observations, by part of a Dict; empty where they are not normalised."""
+    """Return statistics of observations by part of a Dict; empty if they are not normalised."""
     rms: Any = getattr(normalize, "obs_rms", None)
     if rms is None or not normalize.norm_obs:
         return {}

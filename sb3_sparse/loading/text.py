@@ -1,4 +1,4 @@
-"""Text files, JSON among them. Needs nothing but Python."""
+"""Reads text and JSON files. Needs nothing but Python."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from sb3_sparse.loading.guard import reading
 
 
 def read_text(path: Path, what: str, cure: str) -> str:
-    """The text in a UTF-8 file, with or without a byte order mark.
+    """Read a UTF-8 file, with or without a byte order mark.
 
-    :param what: as of :func:`~sb3_sparse.loading.guard.reading`
-    :param cure: as of :func:`~sb3_sparse.loading.guard.reading`
-    :raises ConfigError: if it cannot be opened
-    :raises CorruptStateError: if it is not UTF-8
+    :param what: see :func:`~sb3_sparse.loading.guard.reading`
+    :param cure: see :func:`~sb3_sparse.loading.guard.reading`
+    :raises ConfigError: if the file cannot be opened
+    :raises CorruptStateError: if the file is not UTF-8
     """
     with reading(path, what, cure):
         content = path.read_bytes()
@@ -31,19 +31,19 @@ def read_text(path: Path, what: str, cure: str) -> str:
 
 
 def read_json(path: Path, what: str, cure: str) -> dict[str, Any]:
-    """The mapping in a JSON file.
+    """Read the mapping in a JSON file.
 
-    :param what: as of :func:`~sb3_sparse.loading.guard.reading`
-    :param cure: as of :func:`~sb3_sparse.loading.guard.reading`
-    :raises ConfigError: if it cannot be opened
-    :raises CorruptStateError: if it holds something else
+    :param what: see :func:`~sb3_sparse.loading.guard.reading`
+    :param cure: see :func:`~sb3_sparse.loading.guard.reading`
+    :raises ConfigError: if the file cannot be opened
+    :raises CorruptStateError: if the file holds something else
     """
     text = read_text(path, what, cure)
     with reading(path, what, cure):
         content = json.loads(text)
     if not isinstance(content, dict):
         raise CorruptStateError(
-            f"{path} is damaged, or is no {what}: it holds a {type(content).__name__} where a "
-            f"mapping should be; {cure}"
+            f"{path} is damaged, or holds no {what}: it is a {type(content).__name__} instead "
+            f"of a mapping; {cure}"
         )
     return content

@@ -1,4 +1,4 @@
-"""The zip of a model, as SB3 saves it: looked into, or read whole."""
+"""Reads the zip of a model saved by SB3, completely or without unpickling."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ WHAT = "model saved by SB3"
 CURE = "give a model saved by SB3, e.g. model.zip, or an earlier checkpoint"
 MASK = "_mask"
 ROOMY = 2**34
-"""Bytes of one member that no policy needs, and a damaged header may claim."""
+"""Bytes of a member that no policy reaches, but a damaged header may claim."""
 
 
 @dataclass(frozen=True)
 class Contents:
-    """What can be seen of a model without running anything that its file says.
+    """The contents of a model's file that can be read without running code from it.
 
-    :param data: the model's attributes; of what SB3 pickles, the plain values that it writes beside
+    :param data: the model's attributes; for pickled ones, the plain values that SB3 writes too
     :param state: the policy's state_dict
     """
 
@@ -36,10 +36,10 @@ class Contents:
 
 
 def look_into(path: Path) -> Contents:
-    """Names, shapes and values of a saved model; nothing is unpickled, so any file is safe.
+    """Read names, shapes and values of a saved model; nothing is unpickled, so any file is safe.
 
-    :raises ConfigError: if it cannot be opened
-    :raises CorruptStateError: if it is no model
+    :raises ConfigError: if the file cannot be opened
+    :raises CorruptStateError: if the file is not a model
     """
     _check_file(path)
     with reading(path, WHAT, CURE), zipfile.ZipFile(path) as archive:
@@ -53,17 +53,17 @@ def look_into(path: Path) -> Contents:
             io.BytesIO(archive.read("policy.pth")), map_location="cpu", weights_only=True
         )
     if not isinstance(data, dict):
-        raise CorruptStateError(f"{path} is damaged: its data are no mapping; {CURE}")
+        raise CorruptStateError(f"{path} is damaged: its data are not a mapping; {CURE}")
     return Contents(data, _checked(path, state))
 
 
 def read_model(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    """What SB3 saved: data, and the policy's state_dict.
+    """Read a model's attributes and its policy's state_dict.
 
-    Unpickles the data, as SB3's ``load`` does: the file must come from somebody who is trusted.
+    This unpickles the attributes, as SB3's ``load`` does, so the file must be trusted.
 
-    :raises ConfigError: if it cannot be opened
-    :raises CorruptStateError: if it is no model
+    :raises ConfigError: if the file cannot be opened
+    :raises CorruptStateError: if the file is not a model
     """
     _check_file(path)
     with reading(path, WHAT, CURE):
@@ -74,12 +74,12 @@ def read_model(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 def check_state(state: Mapping[str, Any], where: str) -> None:
-    """Refuse a network that is not finite, or whose masks contradict its weights.
+    """Reject a network that is not finite, or whose masks contradict its weights.
 
     :param state: a policy's state_dict
-    :param where: what to call the model in the error, e.g. its path
+    :param where: the model's name in errors, e.g. its path
     :raises Diverged: if a value is NaN or infinite
-    :raises CorruptStateError: for weights where their mask has none, which loading would set to 0
+    :raises CorruptStateError: for inactive weights other than 0, which loading would set to 0
     """
     check_finite(state, where)
     for name, mask in state.items():
@@ -96,17 +96,17 @@ def check_state(state: Mapping[str, Any], where: str) -> None:
             raise CorruptStateError(
                 f"masks and weights disagree in {where}: {wrong} connections of "
                 f"{name.removesuffix('.weight_mask')} are not 0 though its mask has them "
-                "inactive; somebody changed the file. Take an earlier one, or load it with "
+                "inactive; the file was changed. Take an earlier one, or load it with "
                 "<algorithm>.load, which sets them to 0, and save it again"
             )
 
 
 def check_finite(state: Mapping[str, Any], where: str) -> None:
-    """Refuse a network with values that are NaN or infinite.
+    """Reject a network with values that are NaN or infinite.
 
     :param state: a policy's state_dict
-    :param where: what to call the model in the error, e.g. its path
-    :raises Diverged: if so; names the first such layer and how many more there are
+    :param where: the model's name in errors, e.g. its path
+    :raises Diverged: names the first such tensor and the number of others
     """
     found: dict[str, str] = {}
     for name, tensor in state.items():
@@ -118,7 +118,7 @@ def check_finite(state: Mapping[str, Any], where: str) -> None:
         more = f" (and {len(found) - 1} more tensors)" if len(found) > 1 else ""
         raise Diverged(
             f"the training of {where} diverged: {next(iter(found.values()))}{more}. Take "
-            "an earlier checkpoint or best_model.zip, if they are finite, or train anew with a "
+            "an earlier checkpoint or best_model.zip, if they are finite, or train again with a "
             "smaller learning rate"
         )
 
@@ -129,7 +129,7 @@ def _check_file(path: Path) -> None:
 
 
 def _checked(path: Path, state: Any) -> dict[str, Any]:
-    """A state_dict: tensors by name, and what else modules keep."""
+    """Check that a policy is a state_dict, and return a copy."""
     if not isinstance(state, dict) or not all(isinstance(name, str) for name in state):
-        raise CorruptStateError(f"{path} is damaged: its policy is no state_dict; {CURE}")
+        raise CorruptStateError(f"{path} is damaged: its policy is not a state_dict; {CURE}")
     return dict(state)

@@ -1,4 +1,4 @@
-"""The YAML files of rl-zoo's run folders, read without running what they say."""
+"""Reads the YAML files of rl-zoo's run folders without running code from them."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ PYTHON = "tag:yaml.org,2002:python/"
 
 @dataclass(frozen=True)
 class NotBuilt:
-    """Stands for a Python object that a file asks for and that was not made.
+    """Stands for a Python object that a file asks for.
 
-    :param tag: what the file asks for, e.g. ``"object/apply:os.system"``
+    :param tag: the file's tag for it, e.g. ``"object/apply:os.system"``
     """
 
     tag: str
@@ -32,20 +32,20 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc]
     """Knows rl-zoo's harmless tags; every other Python object becomes a :class:`NotBuilt`."""
 
     def ordered(self, node: Any) -> dict[Any, Any]:
-        """An OrderedDict, written as a call with one list of pairs."""
+        """Read an OrderedDict, written as a call with one list of pairs."""
         (pairs,) = self.construct_sequence(node, deep=True)
         return dict(pairs)
 
     def tuple_(self, node: Any) -> tuple[Any, ...]:
-        """A tuple."""
+        """Read a tuple."""
         return tuple(self.construct_sequence(node, deep=True))
 
     def name(self, suffix: str, node: Any) -> str:
-        """A class or function, as its dotted path."""
+        """Read a class or function as its dotted path."""
         return suffix
 
     def other(self, suffix: str, node: Any) -> NotBuilt:
-        """Anything else."""
+        """Read anything else."""
         return NotBuilt(suffix)
 
 
@@ -56,11 +56,11 @@ _Loader.add_multi_constructor(PYTHON, _Loader.other)
 
 
 def read_zoo_yaml(path: Path, cure: str) -> dict[str, Any]:
-    """The mapping in ``args.yml`` or ``config.yml`` of a run.
+    """Read the mapping in ``args.yml`` or ``config.yml`` of a run.
 
-    :param cure: what to do if it cannot be read
-    :raises ConfigError: if it cannot be opened
-    :raises CorruptStateError: if it holds something else
+    :param cure: what to do if the file cannot be read
+    :raises ConfigError: if the file cannot be opened
+    :raises CorruptStateError: if the file holds something else
     """
     what = "YAML file of a run"
     text = read_text(path, what, cure)
@@ -68,16 +68,16 @@ def read_zoo_yaml(path: Path, cure: str) -> dict[str, Any]:
         content = yaml.load(text, Loader=_Loader)
     if not isinstance(content, dict) or not all(isinstance(key, str) for key in content):
         raise CorruptStateError(
-            f"{path} is damaged, or is no {what}: it does not map names to values; {cure}"
+            f"{path} is damaged, or holds no {what}: it does not map names to values; {cure}"
         )
     return content
 
 
 def check_built(value: Any, where: str) -> None:
-    """Refuse a value that holds a Python object which was not made.
+    """Reject a value that contains a :class:`NotBuilt`.
 
-    :param where: what to call it in the error
-    :raises CorruptStateError: if so
+    :param where: the value's name in the error
+    :raises CorruptStateError: if it contains one
     """
     parts: list[Any] = [value]
     while parts:
@@ -85,7 +85,7 @@ def check_built(value: Any, where: str) -> None:
         if isinstance(part, NotBuilt):
             raise CorruptStateError(
                 f"{where} asks for the Python object {part.tag!r}, which is not built, since files "
-                "are read without running them; write a plain value there"
+                "are read without running code; write a plain value there"
             )
         if isinstance(part, dict):
             parts += [*part.keys(), *part.values()]

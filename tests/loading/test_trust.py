@@ -71,7 +71,7 @@ def test_inspect_runs_no_pickle_in_place_of_the_weights(tmp_path):
     with zipfile.ZipFile(tmp_path / "model.zip", "w") as new:
         new.writestr("data", data)
         new.write(tmp_path / "policy.pth", "policy.pth")
-    with pytest.raises(CorruptStateError, match="is damaged, or is no model saved by SB3"):
+    with pytest.raises(CorruptStateError, match="is damaged, or holds no model saved by SB3"):
         inspect_model(tmp_path / "model.zip")
     assert not ran.exists()
 

@@ -88,7 +88,7 @@ def test_an_unfinished_run_is_named(folders, status):
         (lambda f: (f / "sparsity.json").write_text('{"status": "fin'), "damaged"),
         (
             lambda f: (f / "sparsity.json").write_text("[]"),
-            "holds a list where a mapping should be",
+            "is a list instead of a mapping",
         ),
         (lambda f: (f / "sparsity.json").write_bytes(b"\xff\xfe\x00"), "is not UTF-8 text"),
         (lambda f: (f / "sparsity.json").unlink(), "no run of sb3-sparse"),

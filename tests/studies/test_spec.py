@@ -255,5 +255,5 @@ def test_cells_that_stand_there_twice_are_trained_once_and_named(tmp_path, capsy
     read(tmp_path, runs=runs)
     status(path, "smoke", tmp_path / "store")
     said = capsys.readouterr().out
-    assert f"in the file more than once, and trained once: {study.merged[0]}; " in said
+    assert f"listed more than once, but trained once: {study.merged[0]}; " in said
     assert not (tmp_path / "store").exists()

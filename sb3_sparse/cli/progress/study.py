@@ -1,4 +1,4 @@
-"""What a user sees while a study's runs go on."""
+"""The bar of a study."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ if TYPE_CHECKING:
 
 
 class StudyProgress:
-    """A line for each run that ends, and below them a bar with counts and the time left.
+    """Prints a line for each finished run, above a bar with counts and the time left.
 
-    :param console: where to print; one that is no terminal gets the lines alone
+    :param console: where to print; without a terminal there is no bar
     """
 
     def __init__(self, console: Console) -> None:
@@ -25,7 +25,7 @@ class StudyProgress:
         self.bar: Bars | None = None
 
     def __call__(self, progress: Progress) -> None:
-        """Show how far it is."""
+        """Show the progress."""
         if self.bar is None:
             self.bar = Bars(
                 BarColumn(bar_width=30),
@@ -35,10 +35,10 @@ class StudyProgress:
                 disable=not self.console.is_terminal,
             )
             self.task = self.bar.add_task("", total=progress.planned, status="starting")
-            self.console.print(f"{progress.done} of {progress.planned} runs are done already")
+            self.console.print(f"{progress.done} of {progress.planned} runs are already done")
             self.bar.start()
         for name in progress.retried[self.retried :]:
-            self.console.print(f"failed, tried again at the end: {name}")
+            self.console.print(f"failed, will be tried again at the end: {name}")
         self.retried = len(progress.retried)
         if progress.ended is not None:
             done = f"{progress.done} of {progress.planned}"
@@ -57,7 +57,7 @@ class StudyProgress:
 
 
 def time_left(progress: Progress) -> str:
-    """In words."""
+    """Describe the time left."""
     seconds = progress.seconds_left
     if seconds is None:
         return "time left unknown"
