@@ -12,6 +12,7 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 
 from sb3_sparse.errors import ConfigError
+from sb3_sparse.loading.statistics import mismatch
 
 Observations = Any
 """An array with an observation per row, or a dict of such arrays."""
@@ -178,22 +179,11 @@ def check_statistics(space: spaces.Space[Any], normalization: VecNormalize) -> N
 
     :raises ConfigError: if they do not fit
     """
-    rms: Any = normalization.obs_rms
-    parts = space.spaces if isinstance(space, spaces.Dict) else None
-    if isinstance(rms, dict):
-        fits = parts is not None and all(
-            key in parts and known.mean.shape == parts[key].shape for key, known in rms.items()
-        )
-        seen = f"a dict of shapes { {key: known.mean.shape for key, known in rms.items()} }"
-    else:
-        fits = parts is None and rms.mean.shape == space.shape
-        seen = f"observations of shape {rms.mean.shape}"
-    if not fits:
-        taken = f"those in {space}" if parts is not None else f"shape {space.shape}"
+    if wrong := mismatch(normalization, space):
         raise ConfigError(
-            f"the statistics are of {seen}, the policy takes {taken}. Give those of the same "
-            "run; if its frames were stacked after normalisation, it can be exported as 'dense' "
-            "only, since no raw observation stands for the empty frames of a new episode"
+            f"the statistics are {wrong}. Give those of the same run; if its frames were stacked "
+            "after normalisation, it can be exported as 'dense' only, since no raw observation "
+            "stands for the empty frames of a new episode"
         )
 
 

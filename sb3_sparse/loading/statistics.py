@@ -55,21 +55,23 @@ def load_statistics(path: Path, envs: VecEnv) -> VecNormalize:
     :raises ConfigError: as :func:`read_statistics`, or if the observations do not match
     """
     found = read_statistics(path)
-    space = envs.observation_space
-    shown = {"": space.shape}
-    if isinstance(space, spaces.Dict):
-        shown = {key: part.shape for key, part in space.items()}
-    seen = {key: one.mean.shape for key, one in _parts(found).items()}
-    fits = all(shown.get(key) == shape for key, shape in seen.items())
-    if found.norm_obs and not (fits and seen):
-        raise ConfigError(
-            f"the statistics in {path} are for observations of shape "
-            f"{', '.join(map(str, seen.values())) or 'unknown'}, the environment shows "
-            f"{', '.join(map(str, shown.values()))}; {CURE}"
-        )
+    if wrong := mismatch(found, envs.observation_space):
+        raise ConfigError(f"the statistics in {path} are {wrong}; {CURE}")
     with reading(path, WHAT, CURE):
         found.set_venv(envs)
     return found
+
+
+def mismatch(normalize: VecNormalize, space: spaces.Space[Any]) -> str:
+    """Describe how the statistics of observations differ from a space; empty if they match."""
+    taken = {"": space.shape}
+    if isinstance(space, spaces.Dict):
+        taken = {key: part.shape for key, part in space.items()}
+    seen = {key: one.mean.shape for key, one in _parts(normalize).items()}
+    if not normalize.norm_obs or (seen and all(taken.get(key) == seen[key] for key in seen)):
+        return ""
+    has, wants = (", ".join(map(str, shapes.values())) or "unknown" for shapes in (seen, taken))
+    return f"for observations of shape {has}, but those here have shape {wants}"
 
 
 def _parts(normalize: VecNormalize) -> dict[str, RunningMeanStd]:

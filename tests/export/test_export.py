@@ -90,7 +90,7 @@ def test_normalisation_of_rewards_alone_is_none(tmp_path):
 
 def test_statistics_of_another_environment_are_refused(model, tmp_path):
     other = VecNormalize(DummyVecEnv([lambda: gym.make("CartPole-v1")]))
-    with pytest.raises(ConfigError, match=r"shape \(4,\), the policy takes shape \(3,\)"):
+    with pytest.raises(ConfigError, match=r"shape \(4,\), but those here have shape \(3,\)"):
         export_policy(model, tmp_path / "policy", "c", vecnormalize=other)
     for content in (pickle.dumps([1]), b"config: 1\nfoo\n", b"no pickle"):
         (tmp_path / "other.pkl").write_bytes(content)

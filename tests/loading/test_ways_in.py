@@ -114,7 +114,7 @@ def test_statistics_beside_a_lone_zip_are_not_passed_over(tmp_path):
 
 def test_statistics_of_other_observations_are_refused(tmp_path):
     VecNormalize(make_vec_env("CartPole-v1")).save(str(tmp_path / "of_cartpole.pkl"))
-    with pytest.raises(ConfigError, match=r"of shape \(4,\), the environment shows \(3,\)"):
+    with pytest.raises(ConfigError, match=r"of shape \(4,\), but those here have shape \(3,\)"):
         load_statistics(tmp_path / "of_cartpole.pkl", make_vec_env(ENV))
 
 

@@ -6,34 +6,26 @@ from datetime import timedelta
 from typing import TYPE_CHECKING
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, TextColumn
-from rich.progress import Progress as Bars
+
+from sb3_sparse.cli.progress import Bar
 
 if TYPE_CHECKING:
     from sb3_sparse.studies import Progress
 
 
-class StudyProgress:
+class StudyProgress(Bar):
     """Prints a line for each finished run, above a bar with counts and the time left.
 
     :param console: where to print; without a terminal there is no bar
     """
 
     def __init__(self, console: Console) -> None:
-        self.console = console
+        super().__init__(console, "runs, {task.fields[status]}")
         self.retried = 0
-        self.bar: Bars | None = None
 
     def __call__(self, progress: Progress) -> None:
         """Show the progress."""
-        if self.bar is None:
-            self.bar = Bars(
-                BarColumn(bar_width=30),
-                MofNCompleteColumn(),
-                TextColumn("runs, {task.fields[status]}", markup=False),
-                console=self.console,
-                disable=not self.console.is_terminal,
-            )
+        if not self.bar.task_ids:
             self.task = self.bar.add_task("", total=progress.planned, status="starting")
             self.console.print(f"{progress.done} of {progress.planned} runs are already done")
             self.bar.start()
@@ -49,11 +41,6 @@ class StudyProgress:
             f"{len(progress.failed)} failed, {time_left(progress)}"
         )
         self.bar.update(self.task, completed=progress.done, status=status)
-
-    def close(self) -> None:
-        """Give the terminal back, also after an interruption."""
-        if self.bar is not None:
-            self.bar.stop()
 
 
 def time_left(progress: Progress) -> str:

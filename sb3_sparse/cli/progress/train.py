@@ -6,23 +6,16 @@ from functools import partial
 from pathlib import Path
 
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TaskID,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
+from rich.progress import TaskID, TimeElapsedColumn, TimeRemainingColumn
 
+from sb3_sparse.cli.progress import Bar
 from sb3_sparse.zoo.match import Match
 from sb3_sparse.zoo.watch import TrainingLog
 
 REFRESH_STEPS = 100
 
 
-class EpisodesProgress:
+class EpisodesProgress(Bar):
     """A bar of the episodes played; without a terminal, a line for each set of episodes.
 
     The bar goes to where ``sys.stdout`` pointed at first, since it may be silenced meanwhile.
@@ -31,18 +24,9 @@ class EpisodesProgress:
     """
 
     def __init__(self, console: Console) -> None:
-        self.progress = Progress(
-            TextColumn("{task.description}", markup=False),
-            BarColumn(bar_width=30),
-            MofNCompleteColumn(),
-            TextColumn("episodes"),
-            TimeElapsedColumn(),
-            console=Console(file=console.file, highlight=False, markup=False),
-            disable=not console.is_terminal,
-            transient=True,
-            redirect_stdout=False,
-            redirect_stderr=False,
-        )
+        apart = Console(file=console.file, highlight=False, markup=False)
+        kept = dict(transient=True, redirect_stdout=False, redirect_stderr=False)
+        super().__init__(apart, "episodes", TimeElapsedColumn(), **kept)
         self.tasks: dict[str, TaskID] = {}
 
     def __call__(self, what: str, done: int, planned: int) -> None:
@@ -51,15 +35,11 @@ class EpisodesProgress:
         :param what: who plays, e.g. ``"Last policy"``
         """
         if what not in self.tasks:
-            self.tasks[what] = self.progress.add_task(what, total=planned)
-            if self.progress.disable:
-                self.progress.console.print(f"{what}, episodes: {planned}")
-            self.progress.start()
-        self.progress.update(self.tasks[what], completed=done)
-
-    def close(self) -> None:
-        """Give the terminal back, also after an interruption."""
-        self.progress.stop()
+            self.tasks[what] = self.bar.add_task(what, total=planned)
+            if self.bar.disable:
+                self.console.print(f"{what}, episodes: {planned}")
+            self.bar.start()
+        self.bar.update(self.tasks[what], completed=done)
 
 
 class TrainingProgress(TrainingLog):
@@ -74,14 +54,7 @@ class TrainingProgress(TrainingLog):
         self.headline = headline
         self.folder: Path | None = None
         self.episodes = EpisodesProgress(console)
-        self.progress = Progress(
-            BarColumn(bar_width=30),
-            MofNCompleteColumn(),
-            TextColumn("steps, {task.fields[status]}", markup=False),
-            TimeRemainingColumn(),
-            console=console,
-            disable=not console.is_terminal,
-        )
+        self.steps = Bar(console, "steps, {task.fields[status]}", TimeRemainingColumn())
 
     def begins(self, folder: Path, match: Match | None) -> None:
         self.folder = folder
@@ -93,22 +66,22 @@ class TrainingProgress(TrainingLog):
 
     def _on_training_start(self) -> None:
         super()._on_training_start()
-        self.task = self.progress.add_task("", total=self.planned, status=self.status())
-        self.progress.start()
+        self.task = self.steps.bar.add_task("", total=self.planned, status=self.status())
+        self.steps.bar.start()
 
     def _on_step(self) -> bool:
-        if self.progress.disable:
+        if self.steps.bar.disable:
             return super()._on_step()
         done = min(self.num_timesteps, self.planned)
         if self.n_calls % REFRESH_STEPS == 0 or done == self.planned:
-            self.progress.update(self.task, completed=done, status=self.status())
+            self.steps.bar.update(self.task, completed=done, status=self.status())
         return True
 
     def _on_training_end(self) -> None:
-        self.progress.update(self.task, completed=self.planned, status=self.status())
+        self.steps.bar.update(self.task, completed=self.planned, status=self.status())
         self.close()
 
     def close(self) -> None:
         """Give the terminal back, also after an interruption."""
-        self.progress.stop()
+        self.steps.close()
         self.episodes.close()

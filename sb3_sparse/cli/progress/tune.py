@@ -5,7 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import TimeElapsedColumn
+
+from sb3_sparse.cli.progress import Bar
 
 if TYPE_CHECKING:
     from sb3_sparse.tuning.backend import FrozenTrial
@@ -22,23 +24,15 @@ def _short(value: object) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
-class TuningProgress:
+class TuningProgress(Bar):
     """Print a line for each trial that ends, above a bar with the best so far.
 
     :param console: where to print; if it is not a terminal, it gets the lines only
     """
 
     def __init__(self, console: Console) -> None:
-        self.console = console
+        super().__init__(console, "trials, {task.fields[status]}", TimeElapsedColumn())
         self.seen: set[int] | None = None
-        self.bar = Progress(
-            BarColumn(bar_width=30),
-            MofNCompleteColumn(),
-            TextColumn("trials, {task.fields[status]}", markup=False),
-            TimeElapsedColumn(),
-            console=console,
-            disable=not console.is_terminal,
-        )
         self.task = self.bar.add_task("", total=None, status="starting")
 
     def __call__(self, status: SearchStatus) -> None:
@@ -46,8 +40,7 @@ class TuningProgress:
         if self.seen is None:
             self.seen = {trial.number for trial in status.done}
             self.bar.start()
-        over = [trial for trial in (*status.done, *status.failed)]
-        for trial in over:
+        for trial in (*status.done, *status.failed):
             if trial.number not in self.seen:
                 self.seen.add(trial.number)
                 self.console.print(self._line(trial, status), soft_wrap=True)
@@ -68,7 +61,3 @@ class TuningProgress:
         so_far = "" if best is None else f", best so far {best.values[0]:.6g} (trial {best.number})"
         count = f"{len(status.done)} of {status.planned}"
         return f"{count}: trial {trial.number} {how} {value}{so_far}; {values_in_words(trial)}"
-
-    def close(self) -> None:
-        """Give the terminal back."""
-        self.bar.stop()
