@@ -6,7 +6,7 @@ import stable_baselines3
 import torch as th
 
 from sb3_sparse.algorithms.off_policy import OffPolicy
-from sb3_sparse.algorithms.training import mean, parts
+from sb3_sparse.algorithms.training import parts
 from sb3_sparse.fused.program import Program
 
 
@@ -41,10 +41,7 @@ class DQN(OffPolicy, stable_baselines3.DQN):
         program.minimise(loss, self.policy.optimizer, clip=program.scalar("max_grad_norm"))
 
     def _train_fused(self, gradient_steps: int, batch_size: int = 100) -> None:
-        self.policy.set_training_mode(True)
-        self._update_learning_rate(self._optimizers())
-        self._begin()
-        source = self._find_source()
+        source = self._start_round()
         losses = []
         for _ in range(gradient_steps):
             machine, _ = self._next_batch(batch_size, source)
@@ -52,5 +49,4 @@ class DQN(OffPolicy, stable_baselines3.DQN):
             machine.run()
             losses.append(machine.number("loss"))
         self._n_updates += gradient_steps
-        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        self.logger.record("train/loss", mean(losses))
+        self._log_round({"loss": losses})

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any, ClassVar, NamedTuple
 
@@ -12,7 +12,7 @@ import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_sparse.algorithms.training import Fused, Methods, features
+from sb3_sparse.algorithms.training import Fused, Methods, features, mean
 from sb3_sparse.fused.errors import NotCovered
 from sb3_sparse.fused.inputs import TYPES
 from sb3_sparse.fused.machine import Machine
@@ -89,6 +89,23 @@ class OffPolicy(Fused, OffPolicyAlgorithm):
         ):
             return IN_PLACE
         return N_STEP if hasattr(buffer, "n_steps") else SAMPLED
+
+    def _start_round(self) -> str:
+        """Start a round of gradient steps; return how to read the replay buffer.
+
+        :raises NotCovered: if SB3 must take them
+        """
+        self.policy.set_training_mode(True)
+        self._update_learning_rate(self._optimizers())
+        self._begin()
+        return self._find_source()
+
+    def _log_round(self, logged: Mapping[str, Sequence[float]]) -> None:
+        """Log the mean of each list of numbers that is not empty, in order."""
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        for name, numbers in logged.items():
+            if numbers:
+                self.logger.record(f"train/{name}", mean(numbers))
 
     @staticmethod
     def _record_transitions(

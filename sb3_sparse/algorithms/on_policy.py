@@ -148,16 +148,8 @@ class OnPolicy(Fused, OnPolicyAlgorithm):
     def _hand_over(self, machine: Machine, part: Minibatch) -> None:
         data = part.data
         if data is not None:
-            machine.load(
-                {
-                    "obs": features(self.policy, data.observations),
-                    "actions": data.actions,
-                    "old_values": data.old_values,
-                    "old_log_prob": data.old_log_prob,
-                    "advantages": data.advantages,
-                    "returns": data.returns,
-                }
-            )
+            rows = {name: getattr(data, name) for name in ARRAYS if name != "obs"}
+            machine.load({"obs": features(self.policy, data.observations), **rows})
             return
         buffer, at = self.rollout_buffer, part.rows.ctypes.data
         machine.set_batch(part.size)

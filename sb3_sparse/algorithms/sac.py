@@ -11,7 +11,7 @@ import torch as th
 from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN
 
 from sb3_sparse.algorithms.off_policy import OffPolicy
-from sb3_sparse.algorithms.training import mean, parts
+from sb3_sparse.algorithms.training import parts
 from sb3_sparse.fused.distributions import least_of, squashed_gaussian
 from sb3_sparse.fused.machine import Machine
 from sb3_sparse.fused.program import Program
@@ -96,11 +96,9 @@ class SAC(OffPolicy, stable_baselines3.SAC):
             program.polyak_update(parts(one), parts(two), program.scalar("tau"))
 
     def _train_fused(self, gradient_steps: int, batch_size: int = 64) -> None:
-        self.policy.set_training_mode(True)
-        self._update_learning_rate(self._optimizers())
-        self._begin()
-        source = self._find_source()
-        logged: dict[str, list[float]] = {}
+        source = self._start_round()
+        names = ("ent_coef", "actor_loss", "critic_loss", "ent_coef_loss")  # in SB3's order
+        logged: dict[str, list[float]] = {name: [] for name in names}
         for step in range(gradient_steps):
             machine, data = self._next_batch(batch_size, source)
             shape = (machine.batch, *(self.action_space.shape or ()))
@@ -113,12 +111,9 @@ class SAC(OffPolicy, stable_baselines3.SAC):
             )
             machine.run(0, last, partial(self._raise_error, machine, data))
             for name in machine.program.logged:
-                logged.setdefault(name, []).append(machine.number(name))
+                logged[name].append(machine.number(name))
         self._n_updates += gradient_steps
-        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        for name in ("ent_coef", "actor_loss", "critic_loss", "ent_coef_loss"):
-            if name in logged:
-                self.logger.record(f"train/{name}", mean(logged[name]))
+        self._log_round(logged)
 
     def _raise_error(self, machine: Machine, data: Any, noise: str) -> None:
         """Let SB3's distribution raise its error, for means that are not finite say."""

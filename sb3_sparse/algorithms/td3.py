@@ -7,7 +7,7 @@ import stable_baselines3
 import torch as th
 
 from sb3_sparse.algorithms.off_policy import OffPolicy
-from sb3_sparse.algorithms.training import mean, parts
+from sb3_sparse.algorithms.training import parts
 from sb3_sparse.fused.distributions import least_of
 from sb3_sparse.fused.program import Program
 
@@ -68,10 +68,7 @@ class TD3(OffPolicy, stable_baselines3.TD3):
         program.polyak_update(parts(self.actor.mu), parts(self.actor_target.mu), tau)
 
     def _train_fused(self, gradient_steps: int, batch_size: int = 100) -> None:
-        self.policy.set_training_mode(True)
-        self._update_learning_rate([self.actor.optimizer, self.critic.optimizer])
-        self._begin()
-        source = self._find_source()
+        source = self._start_round()
         actor_losses, critic_losses = [], []
         for _ in range(gradient_steps):
             delayed = (self._n_updates + 1) % self.policy_delay == 0
@@ -86,10 +83,7 @@ class TD3(OffPolicy, stable_baselines3.TD3):
             critic_losses.append(machine.number("critic_loss"))
             if delayed:
                 actor_losses.append(machine.number("actor_loss"))
-        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        if actor_losses:
-            self.logger.record("train/actor_loss", mean(actor_losses))
-        self.logger.record("train/critic_loss", mean(critic_losses))
+        self._log_round({"actor_loss": actor_losses, "critic_loss": critic_losses})
 
 
 class DDPG(TD3, stable_baselines3.DDPG):

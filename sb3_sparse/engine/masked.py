@@ -49,9 +49,11 @@ class MaskedStorage(LayerStorage):
     :param module: the Linear or Conv layer; it stays in place
     """
 
+    is_sparse = False
+
     def __init__(self, name: str, module: Prunable) -> None:
         super().__init__(name, module, tuple(module.weight.shape))
-        self._targets: list[Prunable] = []
+        self.targets: list[Prunable] = []
         self._connections = object()
         self._seen: tuple[int, int] | None = None
         ones = th.ones_like(module.weight, requires_grad=False)
@@ -78,14 +80,6 @@ class MaskedStorage(LayerStorage):
         return filter(None, map(MaskedStorage.of, root.modules()))
 
     @property
-    def targets(self) -> Sequence[Prunable]:
-        return self._targets
-
-    @property
-    def is_sparse(self) -> bool:
-        return False
-
-    @property
     def float_mask(self) -> th.Tensor:
         """1.0 where active, else 0.0, in the weight's shape and on its device."""
         # This is read for every gradient, so it bypasses nn.Module's attribute lookup.
@@ -103,7 +97,7 @@ class MaskedStorage(LayerStorage):
 
     def add_target(self, module: Prunable) -> None:
         """Make ``module`` a target copy of this layer, with the same weights."""
-        self._targets.append(module)
+        self.targets.append(module)
         self._hooks += [
             module.register_load_state_dict_pre_hook(_ignore_mask_key),  # type: ignore[no-untyped-call]
             module.register_load_state_dict_post_hook(self._after_target_load),  # type: ignore[no-untyped-call]
@@ -140,7 +134,7 @@ class MaskedStorage(LayerStorage):
         self.remask()
 
     def _dense_targets(self) -> Iterable[NDArray[np.float32]]:
-        return (target.weight.detach().cpu().numpy() for target in self._targets)
+        return (target.weight.detach().cpu().numpy() for target in self.targets)
 
     def apply_mask(self) -> None:
         """Bring the float mask, nnz and the weight in line with the boolean mask."""

@@ -26,7 +26,9 @@ class SparseStorage(LayerStorage):
     :param optimizers: optimizers whose moments of the weight follow
     """
 
+    is_sparse = True
     module: SparseLinear
+    targets: list[SparseLinear]
 
     def __init__(self, layer: MaskedStorage, optimizers: Sequence[th.optim.Optimizer] = ()) -> None:
         assert isinstance(layer.module, nn.Linear)
@@ -39,24 +41,16 @@ class SparseStorage(LayerStorage):
         layer.release()
         self.module = SparseLinear.convert(layer.module, structure, is_target=False)
         self.module.check_mask = self.check_mask
-        self._targets = []
+        self.targets = []
         self._hooks = [
             self.module.register_load_state_dict_post_hook(self._after_load)  # type: ignore[no-untyped-call]
         ]
         for target in layer.targets:
             assert isinstance(target, nn.Linear)
-            self._targets.append(SparseLinear.convert(target, structure, is_target=True))
+            self.targets.append(SparseLinear.convert(target, structure, is_target=True))
             hook = target.register_load_state_dict_post_hook(self._after_target_load)  # type: ignore[no-untyped-call]
             self._hooks.append(hook)
         self.settle_moments(optimizers)
-
-    @property
-    def targets(self) -> Sequence[SparseLinear]:
-        return self._targets
-
-    @property
-    def is_sparse(self) -> bool:
-        return True
 
     def mask(self) -> NDArray[np.bool_]:
         return self.module.structure.mask()
@@ -66,7 +60,7 @@ class SparseStorage(LayerStorage):
         return array
 
     def mask_targets(self) -> None:
-        for target in self._targets:
+        for target in self.targets:
             target.take(self.module.structure, target.dense())
 
     def remask(self) -> None:
@@ -79,11 +73,11 @@ class SparseStorage(LayerStorage):
         self.module.take(self.module.structure, dense)
 
     def settle_targets(self, soft: bool) -> None:
-        if any(target.snapshot is not None for target in self._targets):  # else they fit
+        if any(target.snapshot is not None for target in self.targets):  # else they fit
             super().settle_targets(soft)
 
     def _dense_targets(self) -> Iterable[NDArray[np.float32]]:
-        return (target.dense().numpy() for target in self._targets)
+        return (target.dense().numpy() for target in self.targets)
 
     def _gradient_mask(self, functional: bool, capturing: Callable[[], bool]) -> GradientMask:
         return SparseStorageGradient(self, functional, capturing)
@@ -137,14 +131,14 @@ class SparseStorage(LayerStorage):
             state[key] = self.saved_moment(value)
         for hook in self._hooks:
             hook.remove()
-        targets = [target.dense() for target in self._targets]
-        for module in (self.module, *self._targets):
+        targets = [target.dense() for target in self.targets]
+        for module in (self.module, *self.targets):
             module.to_linear()
         layer = MaskedStorage(self.name, self.module)
         layer.initial_nnz, layer.final_nnz = self.initial_nnz, self.final_nnz
         layer.set_mask(mask)
         layer.moments_stale = self.moments_stale
-        for target, dense in zip(self._targets, targets, strict=True):
+        for target, dense in zip(self.targets, targets, strict=True):
             layer.add_target(target)
             with th.no_grad():
                 target.weight.copy_(dense)
@@ -168,7 +162,7 @@ class SparseStorage(LayerStorage):
         grad = self.weight.grad
         if grad is not None:
             grad = _followed(grad, dense_grad, before, after, carried)
-        for target in self._targets:
+        for target in self.targets:
             if soft_targets:
                 target.take(after, target.dense())
             else:
@@ -185,7 +179,7 @@ class SparseStorage(LayerStorage):
         structure = self.module.structure
         self.nnz = structure.nnz
         self.moments_stale = True
-        if any(target.structure is not structure for target in self._targets):
+        if any(target.structure is not structure for target in self.targets):
             self.mask_targets()
 
 

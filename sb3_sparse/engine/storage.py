@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
@@ -26,6 +26,11 @@ class LayerStorage(ABC):
     :param module: the Linear or Conv layer; it stays in place
     :param shape: of the dense weight
     """
+
+    is_sparse: ClassVar[bool]
+    """Whether the layer stores and computes its active connections only."""
+    targets: Sequence[Prunable]
+    """The layer's copies in target networks."""
 
     def __init__(self, name: str, module: Prunable, shape: tuple[int, ...]) -> None:
         self.name = name
@@ -66,16 +71,6 @@ class LayerStorage(ABC):
     def frozen(self) -> bool:
         """Whether the weight is not trained, so that its connections do not move."""
         return not self.weight.requires_grad
-
-    @property
-    @abstractmethod
-    def targets(self) -> Sequence[Prunable]:
-        """The layer's copies in target networks."""
-
-    @property
-    @abstractmethod
-    def is_sparse(self) -> bool:
-        """Whether the layer stores and computes its active connections only."""
 
     @abstractmethod
     def mask(self) -> NDArray[np.bool_]:

@@ -173,16 +173,9 @@ class Tables:
             dense = self._dense_grads[number] = _empty(shape[0] * shape[1])
         if module.bias is not None:
             check_readable(module.bias)
-        return [
-            *shape,
-            *addresses,
-            self._address(stored.numbers if packed is None else packed),
-            self._address(module.bias),
-            self._address(turned),
-            self._grad_at(module.weight),
-            self._grad_at(module.bias),
-            self._address(dense),
-        ]
+        numbers = (stored.numbers if packed is None else packed, module.bias, turned)
+        grads = (self._grad_at(module.weight), self._grad_at(module.bias))
+        return [*shape, *addresses, *map(self._address, numbers), *grads, self._address(dense)]
 
     def _captures(self, number: int) -> bool:
         weight = self._program.layers[number].weight
@@ -207,16 +200,12 @@ class Tables:
             if steps is None:
                 steps = _empty(1)
         decay = self._controller.weight_decay if id(slot.tensor) in self._decayed else 0.0
+        values = (number, flat, mask, None if slot.layer is None else packed.get(slot.layer))
         return [
             self._count(slot),
-            self._address(number),
-            self._address(flat),
-            self._address(mask),
-            self._address(None if slot.layer is None else packed.get(slot.layer)),
+            *map(self._address, values),
             self._grad_at(slot.tensor),
-            self._address(first),
-            self._address(second),
-            self._address(steps),
+            *map(self._address, (first, second, steps)),
             self._groups.get(id(slot.tensor), 0),
             bits_of(decay),
         ]
