@@ -1,16 +1,15 @@
 """``learn()`` from end to end: stock SB3, this package, and SBX, which is SB3 in JAX.
 
-This package has two ways: "ours" is its algorithms (``from sb3_sparse import SAC``), "plug-in" is
-stock SB3's with its policy. TQC, QRDQN, CrossQ and TRPO have the second only.
+This package takes part twice: "ours" is its own algorithms (``from sb3_sparse import SAC``), and
+"plug-in" is stock SB3's algorithms with its policy. TQC, QRDQN, CrossQ and TRPO are plug-in only.
 
-Every contender lives in a process of its own. All share one core and one thread, learn in turn, a
-few seconds a round, and are past the steps at which learning starts and SBX compiles. A second is
-one that the process had the core: on an idle core that is the clock's, and what other programs take
-of a busy one does not count (it is said, since they take cache too). Of the rates, round by round,
-the medians and the ranges count. Two parts of a step are timed as well, where they
-are to be had: the rollout part, which is all that is not ``train()``, and within it the choice of
-the action (``predict`` off policy, ``forward`` on policy). Rows are appended to a CSV file as they
-come.
+Each contender has its own process. All share one core and one thread and learn in turn, a few
+seconds per round, after the steps at which learning starts and SBX compiles. Seconds are processor
+time of the process, so the time that other programs take does not count (their load is printed,
+since they use the cache too). Results are medians and ranges of the rates over the rounds. Two
+parts of a step are timed where possible: the rollout part, which is everything but ``train()``, and
+within it the choice of the action (``predict`` off policy, ``forward`` on policy). Rows are
+appended to a CSV file immediately.
 
 A case is ``ALGORITHM-NETWORK`` or ``ALGORITHM-NETWORK@ENVIRONMENT``. The network is the width of
 two layers, or ``nature`` or ``impala`` for images of noise. Hyperparameters are SB3's defaults,
@@ -62,7 +61,7 @@ CASES: dict[str, list[float]] = {
     "dqn4-nature": [0.0, 0.9],
     "dqn4-impala": [0.0, 0.9],
 }
-"""Sparsities by case."""
+"""Sparsities of each case."""
 GRID_WIDTHS = (32, 64, 128, 256, 512, 1024)
 GRID_SPARSITIES = [0.0, 0.5, 0.8, 0.9, 0.95, 0.99]
 FIELDS = [
@@ -73,9 +72,9 @@ FIELDS = [
 
 
 def parsed(case: str) -> tuple[str, str, str]:
-    """Algorithm, network and environment of a case.
+    """Split a case into algorithm, network and environment.
 
-    :raises ValueError: if it is none
+    :raises ValueError: if it is not a case
     """
     name, _, env = case.partition("@")
     algo, _, net = name.partition("-")
@@ -97,9 +96,9 @@ def parsed(case: str) -> tuple[str, str, str]:
 def measure(
     plan: tuple[str, str | None, list[float]], workers: dict[str, Worker], args: argparse.Namespace
 ) -> list[dict[str, Any]]:
-    """Rows of the CSV file: stock, then the plug-in and ours by sparsity, then SBX.
+    """Make rows of the CSV file: stock, then the plug-in and ours by sparsity, then SBX.
 
-    Ours and SBX are left out where they have no such case.
+    Ours and SBX are left out where they do not have the case.
     """
     case, activation, sparsities = plan
     algo, net, env = parsed(case)
@@ -139,12 +138,12 @@ def measure(
 
 
 def rate_of(times: dict[str, float]) -> float:
-    """Steps a second."""
+    """Compute steps per second."""
     return times["steps"] / times["seconds"]
 
 
 def summary(rounds: list[dict[str, float]], stock: list[dict[str, float]]) -> dict[str, Any]:
-    """Medians and ranges, and medians of the ratios to stock, round by round."""
+    """Compute medians and ranges, and medians over the rounds of the ratios to stock."""
 
     def rollout(times: dict[str, float]) -> float:
         return (times["seconds"] - times["train"]) / times["steps"]
@@ -172,12 +171,12 @@ def summary(rounds: list[dict[str, float]], stock: list[dict[str, float]]) -> di
 
 
 def kind_of(row: Mapping[str, Any]) -> str:
-    """The contender of a row, without the method that moves its masks."""
+    """Name the contender of a row, without its method."""
     return str(row["contender"]).partition(",")[0]
 
 
 def line(row: dict[str, Any]) -> str:
-    """A row for people; this package is flagged where it is slower than stock."""
+    """Format a row for reading; flag this package where it is slower than stock."""
     name = row["contender"] + (f" {row['sparsity']:.0%}" if row["sparsity"] != "" else "")
     where = f"{row['case']} {row['activation']}"
     flag = "" if row["core_share"] > 0.95 else f"  had {row['core_share']:.0%} of the core"
@@ -193,9 +192,9 @@ def line(row: dict[str, Any]) -> str:
 
 
 def table(path: Path) -> None:
-    """Print what a CSV file holds as Markdown: a line for each case, sparsity and method.
+    """Print a CSV file as Markdown: a line for each case, sparsity and method.
 
-    Parts of a step are those of ours, or of the plug-in where ours is not there.
+    Parts of a step are those of ours, or of the plug-in where ours does not exist.
     """
     found: dict[tuple[str, ...], dict[str, dict[str, dict[str, str]]]] = {}
     with path.open(newline="") as file:
@@ -237,7 +236,7 @@ def table(path: Path) -> None:
 
 
 def check_sbx(parser: argparse.ArgumentParser, python: str) -> None:
-    """End with a message if that is no Python in which SBX and MuJoCo can be imported."""
+    """Exit with a message unless this Python can import SBX and MuJoCo."""
     try:
         tried = subprocess.run(
             [python, "-c", "import sbx, mujoco"], capture_output=True, text=True, check=False
@@ -250,7 +249,7 @@ def check_sbx(parser: argparse.ArgumentParser, python: str) -> None:
 
 
 def arguments() -> tuple[argparse.Namespace, list[tuple[str, str | None, list[float]]]]:
-    """What was asked for, and what is to be measured: case, activation, sparsities."""
+    """Parse the arguments; give them and the case, activation and sparsities to measure."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--cases", type=listed(str), help=f"default {','.join(CASES)}")
     parser.add_argument("--sparsity", type=listed(float), help="default by case")

@@ -1,9 +1,9 @@
 """One gradient step: stock SB3's, that of stock SB3 with the sparse policy, and this package's own.
 
-The three are timed in turn in one process, on one thread; the medians of the ratios, round by
-round, are what counts. "plug-in" is ``stable_baselines3.SAC`` with ``SparsePolicy``, whose step is
-SB3's own; "fused" is ``sb3_sparse.SAC``, whose step is one call of the kernels. What is timed is
-``train()``, so each draws its batches from its buffer.
+The three are timed in turn in one process, on one thread; the result is the median of the ratios
+over the rounds. "plug-in" is ``stable_baselines3.SAC`` with ``SparsePolicy``, whose step is SB3's
+own; "fused" is ``sb3_sparse.SAC``, whose step is one call of the kernels. The timing covers
+``train()``, so each draws batches from its buffer.
 
     python benchmarks/fused_steps.py                             # two minutes
     python benchmarks/fused_steps.py --cases SAC --sparsity 0.9,0.95,0.99
@@ -28,7 +28,7 @@ import sb3_sparse
 
 
 class Case(NamedTuple):
-    """What is trained: algorithm, width of two layers, samples of a batch."""
+    """A case: algorithm, width of its two layers, batch size."""
 
     algorithm: str
     width: int
@@ -44,11 +44,11 @@ CASES = {
 }
 SPARSITIES = [0.0, 0.9, 0.95]
 STEPS = 20
-"""Gradient steps of one timing."""
+"""Gradient steps in one timing."""
 
 
 def make(package: Any, case: Case, sparsity: float | None) -> Any:
-    """Model, what takes its gradient steps, and how many those are.
+    """Make a model; give a function that takes gradient steps, and their number too.
 
     :param sparsity: None: SB3's own policy
     """
@@ -66,9 +66,9 @@ def make(package: Any, case: Case, sparsity: float | None) -> Any:
 
 
 def time_case(case: Case, sparsity: float, rounds: int) -> dict[str, dict[str, float]]:
-    """Milliseconds a step, and ratios to the others, by contender.
+    """Measure milliseconds per step and ratios to the others, by contender.
 
-    :raises SystemExit: if the steps of ours are not fused
+    :raises SystemExit: if our steps are not fused
     """
     made = {
         "stock": make(stable_baselines3, case, None),
@@ -94,7 +94,7 @@ def time_case(case: Case, sparsity: float, rounds: int) -> dict[str, dict[str, f
 
 
 def lines(cases: list[str], sparsities: list[float], rounds: int) -> Iterator[str]:
-    """The lines of a Markdown table, as they come."""
+    """Yield the lines of a Markdown table."""
     yield "| step | sparsity | way | ms | share of stock's time | of the plug-in's |"
     yield "|---|---|---|---|---|---|"
     for name in cases:

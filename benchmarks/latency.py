@@ -1,8 +1,8 @@
-"""How long one action takes, and how many bytes a policy is, in every form that it can be run in.
+"""Time of one action and bytes of a policy, in every form that can run it.
 
-Actors of SAC with random masks (ERK), at batch 1 on one thread; "narrow dense" has as many
-parameters. All variants of a case are timed in turn in one process, in short bursts; the medians of
-bursts and of their ratios are what counts. Rows are appended to a CSV file as they come.
+The policies are actors of SAC with random masks (ERK), at batch 1 on one thread. "narrow dense"
+has as many parameters. All variants of a case are timed in turn in one process, in short
+bursts; results are medians of bursts and of their ratios. Rows are appended to a CSV file immediately.
 
     python benchmarks/latency.py                        # every case, two or three minutes
     python benchmarks/latency.py --sizes 17-256-256-6 --sparsities 95
@@ -39,7 +39,7 @@ SIZES = ("17-256-256-6", "348-256-256-17", "348-1024-1024-17")
 SPARSITIES = (80, 90, 95, 99)
 OBSERVATIONS = 64
 BURST = 2e-3
-"""Seconds that one burst shall take."""
+"""Seconds of one burst."""
 PLAIN = ("-std=c99", "-O3")
 NATIVE = (*PLAIN, "-march=native")
 LOOP = """
@@ -59,13 +59,13 @@ double seconds(const float *obs, float *action, uint32_t size, uint32_t count)
 """
 KINDS = {"C": PLAIN, "C, -O2": ("-std=c99", "-O2"), "C, -march=native": NATIVE}
 Burst = Callable[[int], float]
-"""Runs that many actions; seconds for all of them."""
+"""Runs a number of actions; returns the seconds for all."""
 Variants = dict[str, tuple[Burst, int]]
-"""A burst and the bytes of what it runs, by name."""
+"""A burst and the bytes of its policy, by name."""
 
 
 def looped(act: Callable[[Any], Any], observations: list[Any]) -> Burst:
-    """Actions called from Python, one by one."""
+    """Make a burst of actions called from Python, one by one."""
 
     def burst(count: int) -> float:
         start = time.perf_counter()
@@ -77,7 +77,7 @@ def looped(act: Callable[[Any], Any], observations: list[Any]) -> Burst:
 
 
 def built(source: Path, options: tuple[str, ...], name: str) -> tuple[Any, int]:
-    """A library with the policy and a loop around it; bytes of the policy's code and constants."""
+    """Compile the policy with a loop around it; give the bytes of its code and constants too."""
     folder = source.parent
     (folder / "loop.c").write_text(LOOP.replace("OBSERVATIONS", f"{OBSERVATIONS}u"))
     library, code = folder / f"{name}.so", folder / f"{name}.o"
@@ -94,7 +94,7 @@ def built(source: Path, options: tuple[str, ...], name: str) -> tuple[Any, int]:
 
 
 def c_bursts(source: Path, rows: np.ndarray, actions: int, kinds: dict[str, Any]) -> Variants:
-    """A C artifact in a loop of its own, with several options, and called through ctypes."""
+    """Make variants of a C artifact: in its own loop, with several options, and through ctypes."""
     found: Variants = {}
     pointer = ctypes.POINTER(ctypes.c_float)
     action = np.empty(actions, np.float32)
@@ -122,7 +122,7 @@ def session_of(path: Path) -> Any:
 
 
 def actor(sizes: list[int], sparsity: float) -> SAC:
-    """An untrained actor; biases are drawn, since a trained one has some too."""
+    """Make an untrained actor with random biases, as a trained one has biases too."""
     inputs, *hidden, outputs = sizes
     space = spaces.Box(-np.inf, np.inf, (inputs,), np.float32)
     env = RandomEnv(space, spaces.Box(-1, 1, (outputs,), np.float32))
@@ -142,7 +142,7 @@ def actor(sizes: list[int], sparsity: float) -> SAC:
 
 
 def empty_session(folder: Path) -> Any:
-    """A graph that does nothing: what a call of onnxruntime costs from Python."""
+    """Make an empty graph, to time a call of onnxruntime from Python."""
     number = onnx.TensorProto.FLOAT
     ends = [onnx.helper.make_tensor_value_info(name, number, [1, 1]) for name in ("obs", "action")]
     node = onnx.helper.make_node("Identity", ["obs"], ["action"])
@@ -153,7 +153,7 @@ def empty_session(folder: Path) -> Any:
 
 
 def variants(sizes: list[int], sparsity: float, folder: Path) -> Variants:
-    """What is timed for one case; the first is what the others are compared to."""
+    """Make the variants of one case; the others are compared to the first."""
     sparse, dense = actor(sizes, sparsity), actor(sizes, 0.0)
     rows = np.random.default_rng(0).normal(size=(OBSERVATIONS, sizes[0])).astype(np.float32)
     each = list(rows)
@@ -202,7 +202,7 @@ def variants(sizes: list[int], sparsity: float, folder: Path) -> Variants:
 
 
 def measure(bursts: dict[str, Burst], rounds: int) -> dict[str, list[float]]:
-    """Seconds an action, of each in turn, after a round that finds out how many a burst has."""
+    """Measure seconds per action of each in turn, after a round that sets the size of bursts."""
     counts = {}
     for name, burst in bursts.items():
         burst(20)

@@ -22,7 +22,7 @@ from typing import Any
 from random_env import IMAGE, RandomEnv
 
 ACTIVATIONS = {"relu": "ReLU", "tanh": "Tanh", "elu": "ELU", "silu": "SiLU"}
-"""Class of torch.nn by name; flax has functions of the lower-case names."""
+"""Classes of torch.nn by name; flax has functions with lower-case names."""
 OFF = dict(learning_starts=100, buffer_size=20_000)
 PPO = dict(n_steps=2048, batch_size=64, n_epochs=10)
 ALGORITHMS: dict[str, tuple[str, dict[str, Any]]] = {
@@ -38,10 +38,10 @@ ALGORITHMS: dict[str, tuple[str, dict[str, Any]]] = {
     "a2c": ("A2C", {}),
     "trpo": ("TRPO", {}),
 }
-"""Class and settings; what is not set is SB3's default: gradient steps too, but for ``dqn`` and
-``qrdqn``, which train at every step of the environment."""
+"""Class and settings of each algorithm; everything else is SB3's default, but ``dqn`` and ``qrdqn``
+train at every step of the environment."""
 IMAGES = {"nature", "impala"}
-"""Networks that take images, from an environment of noise."""
+"""Networks for images, from an environment of noise."""
 
 
 MODULES = {
@@ -50,13 +50,13 @@ MODULES = {
     "ours": ["sb3_sparse"],
     "sbx": ["sbx"],
 }
-"""Where each contender has its algorithms."""
+"""The package of each contender's algorithms."""
 SPARSE = {"plug-in", "ours"}
-"""Contenders that take ``SparsePolicy``."""
+"""Contenders with ``SparsePolicy``."""
 
 
 def algorithm(kind: str, name: str) -> Any:
-    """A contender's class; None where there is none."""
+    """Find a contender's class; None if it has none."""
     for module in MODULES[kind]:
         try:
             found = getattr(importlib.import_module(module), name, None)
@@ -70,7 +70,7 @@ def algorithm(kind: str, name: str) -> Any:
 
 
 def network(kind: str, net: str, activation: str | None) -> dict[str, Any]:
-    """Policy arguments for two layers of ``net`` units, or for an image network."""
+    """Make policy arguments for two layers of ``net`` units, or for an image network."""
     found: dict[str, Any] = {}
     if net == "impala":
         from sb3_sparse.networks import ImpalaCNN
@@ -92,7 +92,7 @@ def network(kind: str, net: str, activation: str | None) -> dict[str, Any]:
 
 
 def build(spec: dict[str, Any]) -> Any:
-    """A model that has not trained yet; None if we or SBX have none of this kind."""
+    """Make an untrained model; None if the contender has none of this kind."""
     kind, net = spec["kind"], spec["net"]
     name, settings = ALGORITHMS[spec["algo"]]
     made = algorithm(kind, name)
@@ -118,7 +118,7 @@ def build(spec: dict[str, Any]) -> Any:
 
 
 class Meter:
-    """Processor seconds spent in the functions that it was put around."""
+    """Measures processor seconds in the functions that it wraps."""
 
     def __init__(self) -> None:
         self.seconds = 0.0
@@ -136,9 +136,9 @@ class Meter:
 
 
 class Learner:
-    """A model, and how long its parts take.
+    """Trains a model and times its parts.
 
-    Three clocks run: around ``learn()``, around ``train()``, and around what chooses an action:
+    Three clocks run: around ``learn()``, around ``train()``, and around the choice of an action:
     ``model.predict`` off policy, ``policy.forward`` on policy (``predict_all`` in SBX).
     """
 
@@ -162,7 +162,7 @@ class Learner:
         model.learn(getattr(model, "learning_starts", 0) + 20)  # SBX compiles here
 
     def learn(self, steps: int) -> dict[str, float]:
-        """Processor seconds of so many steps, at least: on policy they are whole rollouts."""
+        """Measure processor seconds of at least so many steps, in whole rollouts on policy."""
         before = self.model.num_timesteps
         start, began = time.process_time(), time.perf_counter()
         self.train.seconds = self.act.seconds = 0.0
@@ -200,7 +200,7 @@ def main() -> None:
 
 
 class Worker:
-    """The process, seen from the one that asks."""
+    """Starts the process and sends it requests."""
 
     def __init__(self, python: str) -> None:
         flags = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
@@ -214,9 +214,9 @@ class Worker:
         )
 
     def ask(self, **request: Any) -> Any:
-        """The answer to a request.
+        """Send a request and return the answer.
 
-        :raises SystemExit: if the process ends instead; why stands on stderr
+        :raises SystemExit: if the process ends instead; stderr shows why
         """
         assert self.process.stdin is not None
         assert self.process.stdout is not None

@@ -1,13 +1,13 @@
-"""Does every method learn? Real training on small tasks, one CSV row a seed.
+"""Does every method learn? Training on small tasks, with one CSV row per seed.
 
-The settings are the RL zoo's tuned ones (not the paper's, which zoo_hparams/ has), with the mask
-settings of the paper; dense is SB3's own policy.
+Settings are the RL zoo's tuned ones (zoo_hparams/ has those of the paper), with the paper's mask
+settings; dense is SB3's own policy.
 
-Two returns are kept, each the mean of 50 episodes of the deterministic policy: of the last policy,
-and of the best checkpoint of the last fifth of training, chosen by 10 other episodes each (as the
-RL zoo's EvalCallback chooses, but only where masks stand still and pruning is done).
+Two returns are recorded, each the mean of 50 episodes of the deterministic policy: that of the last
+policy, and that of the best checkpoint of the last fifth of training, chosen by 10 other episodes
+(as the RL zoo's EvalCallback does, but only after masks have stopped moving).
 
-A run that is in the CSV already is not run again, so an interrupted benchmark continues.
+Runs that are already in the CSV are skipped, so an interrupted benchmark continues.
 
     python benchmarks/learning.py --workers 2                  # about 50 minutes on two cores
     python benchmarks/learning.py --table                      # the table of what is there
@@ -100,7 +100,7 @@ class BestCheckpoint(EvalCallback):
 
 
 def make(algo: str, env, method: str, seed: int, **settings) -> tuple[BaseAlgorithm, list]:
-    """The model and the callback that moves its masks."""
+    """Make the model and the callback that moves its masks."""
     kwargs = {"net_arch": NET_ARCH[algo]} if algo in NET_ARCH else {}
     callbacks = []
     if method != "dense":
@@ -119,14 +119,14 @@ def make(algo: str, env, method: str, seed: int, **settings) -> tuple[BaseAlgori
 
 
 def evaluate(model: BaseAlgorithm, env_id: str, seed: int) -> float:
-    """Mean return on fresh environments."""
+    """Compute the mean return on fresh environments."""
     env = make_vec_env(env_id, n_envs=1, seed=seed + 10_000)
     mean, _ = evaluate_policy(model, env, n_eval_episodes=EPISODES, deterministic=True)
     return mean
 
 
 def one_run(algo: str, method: str, seed: int) -> dict[str, object]:
-    """Train and evaluate; the CSV row."""
+    """Train and evaluate; return the CSV row."""
     th.set_num_threads(1)
     env_id, steps = TASKS[algo], STEPS[algo]
     env = make_vec_env(env_id, n_envs=ENVS[algo], seed=seed)
@@ -148,7 +148,7 @@ def one_run(algo: str, method: str, seed: int) -> dict[str, object]:
 
 
 def curve(method: str, steps: int, seed: int) -> None:
-    """SAC on HalfCheetah; evaluation every 5,000 steps, appended as it comes."""
+    """Train SAC on HalfCheetah; append an evaluation every 5,000 steps."""
     th.set_num_threads(1)
     env_id = "HalfCheetah-v5"
     path = RESULTS / "half_cheetah.csv"
@@ -171,7 +171,7 @@ def curve(method: str, steps: int, seed: int) -> None:
 
 
 def table(path: Path) -> str:
-    """A Markdown table of the CSV."""
+    """Format the CSV as a Markdown table."""
     with path.open(newline="") as file:
         rows = list(csv.DictReader(file))
     lines = [

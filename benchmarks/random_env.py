@@ -1,4 +1,4 @@
-"""An environment of noise, where what is timed does not care what it learns from."""
+"""An environment of noise, for timing."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ TORQUES = spaces.Box(-1.0, 1.0, (6,), np.float32)
 
 
 class RandomEnv(gym.Env):
-    """Observations and rewards at random, from the given spaces; episodes never end."""
+    """Gives random observations of the given space and random rewards; episodes never end."""
 
     def __init__(self, observation_space: spaces.Space, action_space: spaces.Space) -> None:
         self.observation_space = observation_space

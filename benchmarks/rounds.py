@@ -1,4 +1,4 @@
-"""Rounds in which all contenders take their turn, so that a slow machine slows all of them."""
+"""Interleaved rounds, so that a slow phase of the machine slows all contenders alike."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 
 
 def in_turn(steps: dict[str, Callable[[], Any]], rounds: int) -> dict[str, list[Any]]:
-    """What each step returned, ``rounds`` times in turn, after one round to warm up."""
+    """Run all steps in turn, ``rounds`` times after a warm-up; return their results by name."""
     found: dict[str, list[Any]] = {name: [] for name in steps}
     for _ in range(rounds + 1):
         for name, step in steps.items():
@@ -21,7 +21,7 @@ def in_turn(steps: dict[str, Callable[[], Any]], rounds: int) -> dict[str, list[
 
 
 def interleaved(steps: dict[str, Callable[[], Any]], rounds: int) -> dict[str, list[float]]:
-    """Seconds that each step took, ``rounds`` times in turn, after one round to warm up."""
+    """Time all steps in turn, ``rounds`` times after a warm-up; return seconds by name."""
 
     def timed(step: Callable[[], Any]) -> Callable[[], float]:
         def run() -> float:
@@ -35,7 +35,7 @@ def interleaved(steps: dict[str, Callable[[], Any]], rounds: int) -> dict[str, l
 
 
 def listed(kind: Callable[[str], Any]) -> Callable[[str], list[Any]]:
-    """For argparse: values separated by commas."""
+    """Make an argparse type for values separated by commas."""
 
     def parts(text: str) -> list[Any]:
         try:
@@ -50,7 +50,7 @@ def listed(kind: Callable[[str], Any]) -> Callable[[str], list[Any]]:
 
 @contextmanager
 def appending(path: Path, fields: list[str]) -> Iterator[Callable[[dict[str, Any]], None]]:
-    """Write rows to the end of a CSV file, each at once; a new file gets a header."""
+    """Append rows to a CSV file immediately; a new file gets a header."""
     new = not path.exists()
     with path.open("a", newline="") as file:
         writer = csv.DictWriter(file, fields)

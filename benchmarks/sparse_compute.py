@@ -1,7 +1,7 @@
-"""What sparse storage gains in a layer or a gradient step, and which rivals win.
+"""The gain of sparse storage in a layer or a gradient step, beside its rivals.
 
-All variants of a case are timed in turn in one process; the medians of the ratios, round by round,
-are what counts. Rows are appended to a CSV file as they come.
+All variants of a case are timed in turn in one process; the result is the median of the ratios over
+the rounds. Rows are appended to a CSV file immediately.
 
     python benchmarks/sparse_compute.py                     # layers, and steps 256 and 1024 wide
     python benchmarks/sparse_compute.py --steps --widths 256,512,1024,2048,4096   # hours
@@ -47,9 +47,9 @@ Variant = tuple[Any, Callable[[], None], int]
 def rows_of(
     what: str, case: str, batch: int, sparsity: float, times: dict[str, list[float]], count: int
 ) -> Iterator[dict]:
-    """A row of the CSV file for each variant; the first is what the others are compared with.
+    """Make a row of the CSV file for each variant; the others are compared to the first.
 
-    :param count: steps that each time is of
+    :param count: steps in each timing
     """
     base = next(iter(times.values()))
     for name, found in times.items():
@@ -68,7 +68,7 @@ def rows_of(
 
 
 def layer_steps(width: int, batch: int, sparsity: float) -> dict[str, Callable[[], Any]]:
-    """Forward and backward of a square layer with ReLU, dense and in sparse storage."""
+    """Time forward and backward passes of a square layer with ReLU, dense and sparse."""
     random = np.random.default_rng(0)
     nnz = round(width * width * (1 - sparsity))
     flat = np.sort(random.choice(width * width, nnz, replace=False))
@@ -112,7 +112,7 @@ def layer_steps(width: int, batch: int, sparsity: float) -> dict[str, Callable[[
 
 
 def time_single(widths: list[int], sparsities: list[float], rounds: int) -> Iterator[dict]:
-    """Forward of three layers on one observation, as in a rollout."""
+    """Time the forward pass of three layers on one observation, as in a rollout."""
     for width in widths:
         dense = th.nn.Sequential(
             *(th.nn.Linear(17, width), th.nn.ReLU()),
@@ -171,7 +171,7 @@ def maker(algo: str, widths: list[int], steps: int) -> Callable[..., Variant]:
 
 
 def state_bytes(model: Any) -> int:
-    """Parameters, targets, moments, gradients, masks and indices."""
+    """Count the bytes of parameters, targets, moments, gradients, masks and indices."""
     policy = model.policy
     tensors = {id(t): t for t in (*policy.parameters(), *policy.buffers())}
     for parameter in policy.parameters():
@@ -188,7 +188,7 @@ def state_bytes(model: Any) -> int:
 
 
 def narrow(algo: str, width: int, parameters: int) -> list[int]:
-    """Widths of the dense network with as many parameters."""
+    """Compute widths of the dense network with as many parameters."""
 
     def count(widths: list[int]) -> int:
         model, _, _ = maker(algo, widths, 1)("MlpPolicy", {})
@@ -206,7 +206,7 @@ def optimizers(model: Any) -> list[th.optim.Optimizer]:
 def time_steps(
     algo: str, width: int, sparsities: list[float], rounds: int, bf16: bool
 ) -> Iterator[dict]:
-    """Each sparsity beside its rivals; those that do not depend on it are measured with each."""
+    """Time gradient steps at each sparsity beside their rivals."""
     steps = max(2, min(20, round(20 * (256 / width) ** 2)))
     make = maker(algo, [width, width], steps)
     for sparsity in sparsities:
@@ -249,7 +249,7 @@ def time_steps(
 # --- the rule of compute="auto" -----------------------------------------------------------------
 
 BEHIND = 0.05
-"""What auto may take longer than the better of masked and sparse storage, as a share of that."""
+"""How much slower than the better storage auto may be, as a share."""
 
 
 def sparse_layers(model: Any) -> list[str]:
@@ -260,10 +260,10 @@ def sparse_layers(model: Any) -> list[str]:
 def time_rule(
     algo: str, width: int, sparsity: float, activation: str, sets: list[str], rounds: int
 ) -> Iterator[dict]:
-    """Gradient steps with masks, in sparse storage and by the rule, in each instruction set.
+    """Time gradient steps with masks, in sparse storage and by the rule, in each instruction set.
 
-    Where auto stores the same layers as one of the other two, it is the same program, and has that
-    one's times.
+    Where auto stores the same layers as one of the others, it is the same program and gets its
+    times.
     """
     steps = max(2, min(20, round(20 * (256 / width) ** 2)))
     make = maker(algo, [width, width], steps)
@@ -294,7 +294,7 @@ def time_rule(
 
 
 def print_rule(rows: Iterable[Mapping[str, Any]]) -> None:
-    """How far auto is behind the better of the two storages, and where by more than 5 %."""
+    """Print how far auto is behind the better storage, and where by more than 5 %."""
     cases: dict[tuple[str, str], dict[str, float]] = {}
     for row in rows:
         if row["what"] == "rule":
@@ -315,7 +315,7 @@ def print_rule(rows: Iterable[Mapping[str, Any]]) -> None:
 
 
 def table(path: Path) -> None:
-    """Print what a CSV file holds as Markdown: one line a case, one column a variant."""
+    """Print a CSV file as Markdown: a line for each case, a column for each variant."""
     with path.open(newline="") as file:
         rows = list(csv.DictReader(file))
     for what in dict.fromkeys(row["what"] for row in rows):

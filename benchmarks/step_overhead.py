@@ -1,7 +1,7 @@
 """Cost of one masked gradient step, as a ratio to stock dense Stable-Baselines3.
 
-All variants of a case are timed in turn in one process, so that a machine that slows down slows all
-of them; the median of the ratios, round by round, is what counts.
+All variants of a case are timed in turn in one process, so that a slow phase of the machine slows
+all of them; the result is the median of the ratios over the rounds.
 
     python benchmarks/step_overhead.py            # about five minutes
     python benchmarks/step_overhead.py --rounds 5 --cases SAC
@@ -29,7 +29,7 @@ SPARSITY = 0.9
 
 
 def off_policy(algo: Any, env: gym.Env, batch: int, steps: int, **settings: Any) -> Callable:
-    """A maker of models whose ``train`` does ``steps`` gradient steps at a call."""
+    """Make a function that creates models whose ``train`` takes ``steps`` gradient steps."""
 
     def make(policy: str, policy_kwargs: dict[str, Any]) -> tuple[Any, Callable[[], None], int]:
         model = algo(
@@ -43,7 +43,7 @@ def off_policy(algo: Any, env: gym.Env, batch: int, steps: int, **settings: Any)
 
 
 def on_policy(algo: Any, env: gym.Env, batch: int, rollout: int, **settings: Any) -> Callable:
-    """The same for PPO: one call is an epoch over a rollout."""
+    """As :func:`off_policy`, for PPO: one call is an epoch over a rollout."""
 
     def make(policy: str, policy_kwargs: dict[str, Any]) -> tuple[Any, Callable[[], None], int]:
         model = algo(
@@ -75,12 +75,12 @@ SPARSE = dict(sparsity=SPARSITY, compute="masked")  # sparse_compute.py times th
 
 
 def fused_like_stock(model: Any) -> dict[str, Any]:
-    """Stock policy arguments with the optimizer SB3 itself chose, fused."""
+    """Make stock policy arguments with SB3's own optimizer, fused."""
     return dict(optimizer_kwargs={**model.policy.optimizer_kwargs, "fused": True})
 
 
 def time_case(name: str, rounds: int) -> dict[str, tuple[float, float]]:
-    """Milliseconds a step and ratio to stock, by variant."""
+    """Measure milliseconds per step and the ratio to stock, by variant."""
     make, kind, _ = CASES[name]
     stock = make(f"{kind}Policy", {})
     eager = {**stock[0].policy.optimizer_kwargs, "fused": False}
@@ -103,7 +103,7 @@ def time_case(name: str, rounds: int) -> dict[str, tuple[float, float]]:
 
 
 def time_topology_update(width: int, interval: int) -> tuple[float, float]:
-    """Seconds of one RigL update of a width x width layer, and of ``interval`` gradient steps."""
+    """Time one RigL update of a width x width layer, and ``interval`` gradient steps."""
     env = RandomEnv(VECTOR, spaces.Discrete(4))
     make = off_policy(DQN, env, 256, 3, net_arch=[width, width])
     model, train, steps = make("SparsePolicy", dict(SPARSE))

@@ -174,7 +174,7 @@ def test_a_case_names_algorithm_network_and_environment(end_to_end):
         (["--sbx", "/nowhere/python"], "cannot be run"),
     ],
 )
-def test_what_cannot_be_measured_is_refused_at_once(
+def test_what_cannot_be_measured_is_rejected_at_once(
     end_to_end, monkeypatch, capsys, tmp_path, words, message
 ):
     monkeypatch.chdir(tmp_path)
@@ -186,7 +186,7 @@ def test_what_cannot_be_measured_is_refused_at_once(
     assert not list(tmp_path.iterdir())
 
 
-def test_a_python_without_sbx_is_refused_with_the_recipe(end_to_end, monkeypatch, capsys, tmp_path):
+def test_a_python_without_sbx_is_rejected_with_a_recipe(end_to_end, monkeypatch, capsys, tmp_path):
     bare = tmp_path / "python"
     bare.write_text(f'#!/bin/sh\nexec "{sys.executable}" -I -S "$@"\n')  # no site-packages
     bare.chmod(0o755)

@@ -45,7 +45,7 @@ def test_steps_that_are_not_fused_are_not_called_so(fused_steps, monkeypatch):
         fused_steps.time_case(fused_steps.Case("DQN", 8, 8), 0.5, 1)
 
 
-def test_no_case_at_all_is_refused(fused_steps, monkeypatch, capsys):
+def test_no_case_at_all_is_rejected(fused_steps, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["fused_steps.py", "--cases", "SACK"])
     with pytest.raises(SystemExit):
         fused_steps.main()

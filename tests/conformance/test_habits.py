@@ -351,7 +351,7 @@ def test_layers_unfrozen_within_a_round_are_masked_at_the_next_step():
 
 
 @pytest.mark.parametrize("name", ["SAC", "DQN", "PPO"])
-def test_a_layer_that_was_replaced_is_refused_by_name(name):
+def test_a_layer_that_was_replaced_is_rejected_by_name(name):
     model = make(name)
     layer = list(model.policy.sparse.layers)[-1]
     parent, _, child = layer.name.rpartition(".")
@@ -433,7 +433,7 @@ def test_noise_is_gone_from_a_part_that_is_saved_at_once(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["SAC", "DQN"])
-def test_masks_of_another_sparsity_are_refused_by_a_part_and_by_load(name, tmp_path):
+def test_masks_of_another_sparsity_are_rejected_by_a_part_and_by_load(name, tmp_path):
     model, other = make(name), make(name, policy_kwargs=dict(sparsity=0.8))
     part = PARTS[name]
     with pytest.raises(CorruptStateError, match="a policy of this sparsity has"):
@@ -474,7 +474,7 @@ def test_parameters_that_join_an_optimizer_of_the_users_own_are_followed():
 
 
 @pytest.mark.parametrize("name", ["SAC", "PPO"])
-def test_lbfgs_is_refused_once_sparse_masks_have_moved(name, storage):
+def test_lbfgs_is_rejected_once_sparse_masks_have_moved(name, storage):
     model = make(name)
     own = th.optim.LBFGS(model.policy.parameters(), lr=1e-3, max_iter=1)
     parameters = list(model.policy.parameters())

@@ -160,7 +160,7 @@ def test_algorithms_that_cannot_be_sparse_say_so(name):
         algorithm("SparsePolicy", "CartPole-v1", policy_kwargs=dict(sparsity=0.9))
 
 
-def test_observations_that_sb3_cannot_preprocess_are_refused():
+def test_observations_that_sb3_cannot_preprocess_are_rejected():
     from sb3_sparse import SparseSACPolicy
 
     odd = spaces.Tuple((spaces.Discrete(2), spaces.Discrete(2)))

@@ -182,7 +182,7 @@ def test_instruction_sets_agree():
         close(other, found[0])
 
 
-def test_an_unknown_instruction_set_is_refused():
+def test_an_unknown_instruction_set_is_rejected():
     with pytest.raises(ConfigError, match="these do: .*"):
         library.use("altivec")
 
@@ -213,7 +213,7 @@ def test_a_strided_input_is_taken_as_it_is():
     [th.zeros(4, 6), th.zeros(4, 5, dtype=th.float64), th.zeros(())],
     ids=["wide", "double", "0d"],
 )
-def test_what_the_kernels_cannot_read_is_refused(x):
+def test_what_the_kernels_cannot_read_is_rejected(x):
     _, sparse = networks([5, 8, 3], ["some"], nn.ReLU, True, 0)
     with pytest.raises(UnsupportedError, match="takes float32 on the CPU with 5 features"):
         sparse(x)
@@ -384,7 +384,7 @@ def test_what_is_hooked_everywhere_is_called_by_itself():
     assert shapes == [(7, 8), (7, 8), (7, 3), (7, 3)]
 
 
-def test_weights_that_the_kernels_cannot_read_are_refused():
+def test_weights_that_the_kernels_cannot_read_are_rejected():
     _, sparse = networks([5, 8, 3], ["some"], nn.ReLU, True, 0)
     sparse[0].bias.data = th.zeros(16)[::2]
     with pytest.raises(UnsupportedError, match="must be contiguous float32"):

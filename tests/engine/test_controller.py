@@ -347,7 +347,7 @@ class Greedy(TopologyMethod):
         return Exchange(dropped=inactive, grown=np.empty(0, dtype=np.int64))
 
 
-def test_an_impossible_exchange_of_a_third_party_is_refused_by_name():
+def test_an_impossible_exchange_of_a_third_party_is_rejected_by_name():
     with registered(Greedy):
         owner, layer, _ = rig(Greedy.name)
         with pytest.raises(TopologyError, match="exchange for 0 drops 1 and grows 0"):

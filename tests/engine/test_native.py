@@ -62,7 +62,7 @@ def test_a_damaged_library_does_not_load(relocated):
         library.library()
 
 
-def test_a_library_of_another_version_is_refused(monkeypatch):
+def test_a_library_of_another_version_is_rejected(monkeypatch):
     monkeypatch.setattr(library, "VERSION", library.VERSION + 1)
     library.library.cache_clear()
     with pytest.raises(SparsityError, match=r"library has version \d+, this package \d+"):
@@ -70,7 +70,7 @@ def test_a_library_of_another_version_is_refused(monkeypatch):
     library.library.cache_clear()
 
 
-def test_an_unknown_way_to_compute_is_refused():
+def test_an_unknown_way_to_compute_is_rejected():
     from support import make
 
     with pytest.raises(ConfigError, match="compute must be one of 'masked', 'sparse', 'auto'"):

@@ -114,11 +114,11 @@ def test_whether_an_optimizer_acts_on_each_weight_by_itself_is_found_by_trial(
 
 
 @pytest.mark.parametrize("wrong", [-1e-4, float("inf"), float("nan"), "small", True])
-def test_a_weight_decay_that_is_none_is_refused(wrong):
+def test_a_weight_decay_that_is_none_is_rejected(wrong):
     with pytest.raises(ConfigError, match="0 or more"):
         check_weight_decay(wrong, None)
 
 
-def test_weight_decay_given_twice_is_refused():
+def test_weight_decay_given_twice_is_rejected():
     with pytest.raises(ConfigError, match="given twice"):
         check_weight_decay(1e-4, dict(weight_decay=1e-3))

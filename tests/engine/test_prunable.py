@@ -12,7 +12,7 @@ def test_linear_and_conv_are_prunable_and_norms_are_not():
     assert [name for name, _ in find_prunable(net, "net", lambda _: False)] == ["net.0", "net.3"]
 
 
-def test_a_recurrent_layer_is_refused_unless_it_stays_dense():
+def test_a_recurrent_layer_is_rejected_unless_it_stays_dense():
     net = nn.ModuleDict({"memory": nn.LSTM(3, 4), "head": nn.Linear(4, 1)})
     with pytest.raises(UnsupportedError, match=r"net.memory is a LSTM.*dense_layers"):
         list(find_prunable(net, "net", lambda _: False))

@@ -230,7 +230,7 @@ def test_weights_without_a_mask_are_masked():
     np.testing.assert_array_equal(sparse.layer.dense(), dense["weight"].reshape(-1) * mask)
 
 
-def test_an_exchange_that_does_not_fit_is_refused_and_changes_nothing():
+def test_an_exchange_that_does_not_fit_is_rejected_and_changes_nothing():
     _, sparse = twins()
     before = sparse.layer.mask()
     active = np.flatnonzero(before)
@@ -239,7 +239,7 @@ def test_an_exchange_that_does_not_fit_is_refused_and_changes_nothing():
     np.testing.assert_array_equal(sparse.layer.mask(), before)
 
 
-def test_wrong_shapes_and_empty_masks_are_refused_at_load():
+def test_wrong_shapes_and_empty_masks_are_rejected_at_load():
     _, sparse = twins()
     saved = sparse.module.state_dict()
     with pytest.raises(RuntimeError, match=r"size mismatch for weight: .*\(4, 5\)"):

@@ -62,7 +62,7 @@ def test_places_in_another_structure(mask, random):
     [[-1, 2], [0, 6], [1, 1], [3, 2], [[0], [1]]],
     ids=["low", "high", "twice", "order", "2d"],
 )
-def test_bad_indices_are_refused(flat):
+def test_bad_indices_are_rejected(flat):
     with pytest.raises(CorruptStateError, match="2x3 layer must ascend strictly within 0 to 5"):
         Structure(np.array(flat), (2, 3))
 

@@ -82,7 +82,7 @@ def test_scaled_nature_is_natures_at_its_own_width_and_smaller_below():
         (FRAMES, {"channels": (1, 2, 0)}, "three whole numbers"),
     ],
 )
-def test_what_does_not_fit_is_refused(network, space, kwargs, message):
+def test_what_does_not_fit_is_rejected(network, space, kwargs, message):
     with pytest.raises(ConfigError, match=message):
         network(space, **kwargs)
 
