@@ -2,7 +2,8 @@
 
 The policies are actors of SAC with random masks (ERK), at batch 1 on one thread. "narrow dense"
 has as many parameters. All variants of a case are timed in turn in one process, in short
-bursts; results are medians of bursts and of their ratios. Rows are appended to a CSV file immediately.
+bursts; results are medians of bursts and of their ratios. Rows are appended to a CSV file
+immediately.
 
     python benchmarks/latency.py                        # every case, two or three minutes
     python benchmarks/latency.py --sizes 17-256-256-6 --sparsities 95

@@ -8,7 +8,7 @@ from sb3_sparse.engine.native.library import library
 from sb3_sparse.engine.room import Room
 
 
-def gaussian(
+def sample_gaussian(
     mean: th.Tensor, log_std: th.Tensor, noise: th.Tensor | None
 ) -> tuple[th.Tensor, th.Tensor] | None:
     """Compute actions ``(n, dim)`` and their log probabilities ``(n,)``; None if one is not finite.
@@ -28,7 +28,7 @@ def gaussian(
     return room.tensor((n, size), 0), room.tensor((n,), n * size)
 
 
-def squashed(
+def sample_squashed(
     mean: th.Tensor, log_std: th.Tensor, bounds: tuple[float, float], noise: th.Tensor | None
 ) -> tuple[th.Tensor, th.Tensor] | None:
     """Compute Gaussian samples and their tanh, both of the mean's shape; None if not finite.

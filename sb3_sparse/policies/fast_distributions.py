@@ -11,7 +11,7 @@ from stable_baselines3.common.distributions import (
     Distribution,
 )
 
-from sb3_sparse.engine.gaussian import gaussian
+from sb3_sparse.engine.gaussian import sample_gaussian
 
 
 class LazyDistribution:
@@ -52,7 +52,7 @@ class FastGaussian(LazyDistribution, DiagGaussianDistribution):
         ):
             return None  # the user has set another one, which torch can read
         noise = None if deterministic else th.randn((n, size), dtype=th.float32, device="cpu")
-        acted = gaussian(mean, log_std, noise)
+        acted = sample_gaussian(mean, log_std, noise)
         if acted is not None:
             self.remember(mean, log_std.detach())
         return acted

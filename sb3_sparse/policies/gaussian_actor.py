@@ -15,7 +15,7 @@ from stable_baselines3.common.distributions import SquashedDiagGaussianDistribut
 from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN
 from torch.autograd.function import once_differentiable
 
-from sb3_sparse.engine.gaussian import squashed
+from sb3_sparse.engine.gaussian import sample_squashed
 from sb3_sparse.policies.fast_distributions import LazyDistribution
 from sb3_sparse.policies.fast_predict import Actions
 from sb3_sparse.policies.modules import ActingModule
@@ -81,7 +81,7 @@ class FastSquashedGaussian(LazyDistribution, SquashedDiagGaussianDistribution):
         noise = None
         if not deterministic:
             noise = th.randn(mean.shape, dtype=th.float32, device="cpu")
-        acted = squashed(mean, log_std, (LOG_STD_MIN, LOG_STD_MAX), noise)
+        acted = sample_squashed(mean, log_std, (LOG_STD_MIN, LOG_STD_MAX), noise)
         if acted is None:
             return None
         self.remember(mean, log_std)

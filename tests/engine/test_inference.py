@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from torch import nn
 
 from sb3_sparse.engine.activations import ACTIVATIONS
-from sb3_sparse.engine.gaussian import gaussian, squashed
+from sb3_sparse.engine.gaussian import sample_gaussian, sample_squashed
 from sb3_sparse.engine.inference import Inference
 from sb3_sparse.engine.kept import KeptInference
 from sb3_sparse.engine.linear import SparseLinear
@@ -337,7 +337,7 @@ def test_gaussian_actions_and_log_probabilities_are_those_of_the_formula(mean, l
     means = th.tensor([[mean, 0.5, -1.0], [0.0, 0.0, 0.0]])
     noises = th.tensor([[noise, 0.0, 1.0], [0.5, -0.5, 2.0]])
     log_stds = th.tensor([log_std, 0.0, -1.0])
-    taken, log_probs = gaussian(means, log_stds, noises)
+    taken, log_probs = sample_gaussian(means, log_stds, noises)
     actions = means + log_stds.exp() * noises
     np.testing.assert_allclose(taken, actions, rtol=1e-6, atol=1e-6)
     taken = taken.double()
@@ -347,9 +347,9 @@ def test_gaussian_actions_and_log_probabilities_are_those_of_the_formula(mean, l
 
 
 def test_a_gaussian_without_end_is_reported():
-    assert gaussian(th.zeros(1, 1), th.tensor([-200.0]), None) is None
-    assert gaussian(th.full((1, 1), th.nan), th.zeros(1), None) is None
-    assert gaussian(th.zeros(1, 1), th.zeros(1), None) is not None
+    assert sample_gaussian(th.zeros(1, 1), th.tensor([-200.0]), None) is None
+    assert sample_gaussian(th.full((1, 1), th.nan), th.zeros(1), None) is None
+    assert sample_gaussian(th.zeros(1, 1), th.zeros(1), None) is not None
 
 
 @given(
@@ -361,14 +361,14 @@ def test_squashed_actions_are_those_of_the_formula(mean, log_std, noise):
     means, noises = th.tensor([[mean, 0.5]]), th.tensor([[noise, -1.0]])
     log_stds = th.tensor([[log_std, 0.1]])
     bounded = log_stds.clamp(-20, 2)
-    made = squashed(means, log_stds, (-20, 2), noises)
+    made = sample_squashed(means, log_stds, (-20, 2), noises)
     assert th.equal(log_stds, bounded)
     before = means + bounded.exp() * noises
     np.testing.assert_allclose(made[0], before, rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose(made[1], before.tanh(), rtol=1e-6, atol=1e-6)
-    made = squashed(means, log_stds, (-20, 2), None)
+    made = sample_squashed(means, log_stds, (-20, 2), None)
     np.testing.assert_allclose(th.stack(made), th.stack([means, means.tanh()]), rtol=1e-6)
-    assert squashed(th.full((1, 2), th.nan), log_stds, (-20, 2), None) is None
+    assert sample_squashed(th.full((1, 2), th.nan), log_stds, (-20, 2), None) is None
 
 
 def test_layers_that_do_not_fit_each_other_are_left_to_the_modules():
