@@ -1,1 +1,1 @@
-"""The torch mechanism of sparse training: layers, gradient masks, moments, clocks. Knows no SB3."""
+"""The torch mechanism of sparse training: storages, gradient masks and clocks, without SB3."""
