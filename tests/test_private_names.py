@@ -20,14 +20,13 @@ from sb3_sparse.policies import internals as of_sb3
 
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "sb3_sparse"
-GATHERED = {"engine/internals.py", "policies/internals.py"}
+GATHERED = {"engine/internals.py", "policies/internals.py", "tuning/internals.py"}
 # Read from other objects elsewhere, because a subclass or a seam of the library is there.
 ELSEWHERE = {
     "_asdict", "_replace",  # named tuples
     "_getframe",  # sys
     # rl_zoo3
     "_hyperparams", "_preprocess_hyperparams", "_preprocess_action_noise", "_save_config",
-    "_lock", "_trial_id", "_CachedStorage",  # Optuna
 }  # fmt: skip
 
 
