@@ -11,7 +11,7 @@ from sb3_sparse.report.data import LeftOut
 from sb3_sparse.report.figures import FIGURES
 from sb3_sparse.report.results import Results
 from sb3_sparse.report.tables import verdicts_table
-from sb3_sparse.report.verdicts import DECIDED, FINDINGS, LEAST_SEEDS, Verdict
+from sb3_sparse.report.verdicts import FINDINGS, LEAST_SEEDS, Verdict
 
 CSV_FILES = ("cells.csv", "runs.csv", "verdicts.csv")
 PAPER = "The State of Sparse Training in Deep Reinforcement Learning (arXiv:2206.10369)"
@@ -117,7 +117,7 @@ def _counts(content: Content) -> str:
 
 def _verdicts(content: Content) -> str:
     rules = [
-        f"{one.text} {one.rule}; {DECIDED[one.decide]}. At least {LEAST_SEEDS} seeds of both sides."
+        f"{one.text} {one.rule}; {one.region.text}. At least {LEAST_SEEDS} seeds of both sides."
         for one in FINDINGS
     ]
     return html.section(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -23,6 +24,58 @@ from sb3_sparse.report.statistics import difference, iqm, rectangle
 SUPPORTED, CONTRADICTED, UNDECIDED = "supported", "contradicted", "not enough data"
 LEAST_SEEDS = 3
 NO_LOSS, SAME = 0.05, 0.1
+NO_MARGIN = "the other side's IQM is not above 0, so no margin can be a share of it"
+
+
+@dataclass(frozen=True)
+class Region:
+    """The effects for which a finding holds.
+
+    A finding is supported if the effect's interval lies inside, contradicted if it lies outside.
+
+    :param text: the same in words
+    :param low: lower end
+    :param high: upper end
+    :param relative: whether the ends are shares of the other side's statistic
+    """
+
+    text: str
+    low: float = -math.inf
+    high: float = math.inf
+    relative: bool = False
+
+    def verdict(self, low: float, high: float, reference: float) -> tuple[str, str]:
+        """Return the verdict on an interval, and a remark.
+
+        :param low: lower end of the interval
+        :param high: upper end of the interval
+        :param reference: the other side's statistic
+        """
+        if self.relative and reference <= 0:
+            return UNDECIDED, NO_MARGIN
+        scale = reference if self.relative else 1.0
+        remark = f"margin {-self.low * scale:.3g}" if self.relative else ""
+        if low > self.low * scale and high < self.high * scale:
+            return SUPPORTED, remark
+        outside = high < self.low * scale or low > self.high * scale
+        return CONTRADICTED if outside else UNDECIDED, remark
+
+
+GREATER = Region("supported if the interval lies above 0, contradicted if it lies below", low=0.0)
+LESS = Region("supported if the interval lies below 0, contradicted if it lies above", high=0.0)
+NOT_LESS = Region(
+    f"supported if the interval lies above -{NO_LOSS:.0%} of the dense IQM, contradicted if it "
+    "lies below that",
+    low=-NO_LOSS,
+    relative=True,
+)
+CLOSE = Region(
+    f"supported if the interval lies within +-{SAME:.0%} of SET's IQM, contradicted if it lies "
+    "outside",
+    -SAME,
+    SAME,
+    relative=True,
+)
 
 
 @dataclass(frozen=True)
@@ -33,7 +86,7 @@ class Finding:
     :param text: the finding
     :param rule: what is compared
     :param sides: returns the scores of both sides by stratum
-    :param decide: how the interval decides; a key of ``DECIDED``
+    :param region: the effects for which it holds
     :param statistic: the difference of this statistic is the effect
     :param unit: of the effect
     """
@@ -42,7 +95,7 @@ class Finding:
     text: str
     rule: str
     sides: Callable[[Results, str], Sides]
-    decide: str
+    region: Region
     statistic: Callable[[Array], float]
     unit: str
 
@@ -84,14 +137,6 @@ def _average(scores: Array) -> float:
     return float(scores.mean())
 
 
-DECIDED = {
-    "greater": "supported if the interval lies above 0, contradicted if it lies below",
-    "less": "supported if the interval lies below 0, contradicted if it lies above",
-    "no loss": f"supported if the interval lies above -{NO_LOSS:.0%} of the dense IQM, "
-    "contradicted if it lies below that",
-    "same": f"supported if the interval lies within +-{SAME:.0%} of SET's IQM, contradicted if it "
-    "lies outside",
-}
 IQM_UNIT, MEAN_UNIT = "normalised IQM", "normalised mean"
 FINDINGS = (
     Finding(
@@ -99,47 +144,47 @@ FINDINGS = (
         "Sparse networks beat dense ones with as many parameters.",
         "Pruning, SET and RigL (their mean) minus the parameter-equivalent dense network, at all "
         "sparsities from 50 % on; each environment and sparsity is a stratum",
-        sparse_and_equal, "greater", iqm, IQM_UNIT,
+        sparse_and_equal, GREATER, iqm, IQM_UNIT,
     ),
     Finding(
         "no-loss",
         "80 to 90 % sparse networks lose nothing against the dense one of full size.",
         "Pruning, SET and RigL at 80 to 90 % (mean over methods and sparsities) minus the dense "
         "network of full size; each environment is a stratum",
-        sparse_and_dense, "no loss", iqm, IQM_UNIT,
+        sparse_and_dense, NOT_LESS, iqm, IQM_UNIT,
     ),
     Finding(
         "rigl-set",
         "RigL's gradients gain little over SET's random growth.",
         "RigL minus SET at 50 to 95 %; each environment and sparsity is a stratum",
-        rigl_and_set, "same", iqm, IQM_UNIT,
+        rigl_and_set, CLOSE, iqm, IQM_UNIT,
     ),
     Finding(
         "erk",
         "ERK is better than uniform sparsity.",
         "ERK minus uniform, all else the same; each environment, method and sparsity is a stratum",
-        by_distribution, "greater", _average, MEAN_UNIT,
+        by_distribution, GREATER, _average, MEAN_UNIT,
     ),
     Finding(
         "critic",
         "The critic needs the parameters more than the actor.",
         "Runs whose actor has 20 % of the connections or less minus runs whose critic has, all "
         "else the same; each environment, method and sparsity is a stratum",
-        by_share, "greater", _average, MEAN_UNIT,
+        by_share, GREATER, _average, MEAN_UNIT,
     ),
     Finding(
         "weight-decay",
         "A small weight decay helps.",
         "Weight decay above 0 and up to 1e-4 minus none, all else the same; each environment, "
         "method and sparsity is a stratum",
-        by_weight_decay, "greater", _average, MEAN_UNIT,
+        by_weight_decay, GREATER, _average, MEAN_UNIT,
     ),
     Finding(
         "snr",
         "The gradients' signal-to-noise ratio falls with sparsity.",
         "Mean natural logarithm of the SNR over training at the highest sparsity minus that at the "
         "lowest (dense is 0 %); each environment and network is a stratum",
-        by_snr, "less", _average, "log SNR",
+        by_snr, LESS, _average, "log SNR",
     ),
     Finding(
         "noise",
@@ -147,7 +192,7 @@ FINDINGS = (
         "What the upper half of the strengths of noise costs (mean normalised return minus that "
         "without noise): sparse minus parameter-equivalent dense; each environment and sparsity "
         "is a stratum",
-        by_noise, "greater", _average, MEAN_UNIT,
+        by_noise, GREATER, _average, MEAN_UNIT,
     ),
 )  # fmt: skip
 
@@ -182,28 +227,10 @@ def _verdict(finding: Finding, family: str, sides: Sides) -> Verdict:
         return Verdict(finding, family, UNDECIDED, remark=remark)
     remark = "; ".join([*([remark] if remark else []), *dict.fromkeys((*x.remarks, *y.remarks))])
     effect = difference(x.scores, y.scores, finding.statistic)
-    verdict, why = _decide(finding, effect.low, effect.high, finding.statistic(y.scores))
+    reference = finding.statistic(y.scores)
+    verdict, why = finding.region.verdict(effect.low, effect.high, reference)
     remark = "; ".join(text for text in (why, remark) if text)
     return Verdict(
         finding, family, verdict, effect.value, effect.low, effect.high, effect.seeds,
         effect.tasks, remark,
     )  # fmt: skip
-
-
-def _decide(finding: Finding, low: float, high: float, reference: float) -> tuple[str, str]:
-    if finding.decide == "greater":
-        return _of(low > 0, high < 0), ""
-    if finding.decide == "less":
-        return _of(high < 0, low > 0), ""
-    if reference <= 0:
-        return UNDECIDED, "the other side's IQM is not above 0, so no margin can be a share of it"
-    if finding.decide == "no loss":
-        margin = NO_LOSS * reference
-        return _of(low > -margin, high < -margin), f"margin {margin:.3g}"
-    margin = SAME * reference
-    outside = low > margin or high < -margin
-    return _of(low > -margin and high < margin, outside), f"margin {margin:.3g}"
-
-
-def _of(supported: bool, contradicted: bool) -> str:
-    return SUPPORTED if supported else CONTRADICTED if contradicted else UNDECIDED

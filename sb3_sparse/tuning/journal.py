@@ -182,8 +182,6 @@ class QueueJournal(FromQueue, JournalStorage, SignsOfLife):
         """Return the function that is called with each stale trial."""
         return self._stale
 
-    get_failed_trial_callback = get_heartbeat_stale_trial_callback
-
 
 def open_journal(path: Path, interval: int, stale: StaleCallback) -> BaseStorage:
     """Open a journal that workers take trials from; a new one is made.
