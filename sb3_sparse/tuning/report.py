@@ -149,7 +149,7 @@ def _best_by_method(searches: Sequence[Search], storage: BaseStorage) -> str:
     for summary in storage.get_all_studies():
         if DEFINITION not in summary.user_attrs:
             continue
-        search = Search.find(storage, summary.study_name, "the storage")
+        search = Search(optuna.load_study(storage=storage, study_name=summary.study_name))
         try:
             definition, status = search.definition, search.status()
         except SparsityError as error:  # e.g. of an environment or method that is missing here
