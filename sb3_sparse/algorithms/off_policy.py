@@ -72,7 +72,7 @@ class OffPolicy(Fused, OffPolicyAlgorithm):
         return self._machine(self.batch_size, self._find_source())
 
     def _machine(self, batch: int, source: str, *details: Any) -> Machine:
-        """Give the machine for a batch size, a source and details of the algorithm."""
+        """Return the machine for a batch size, a source and details of the algorithm."""
         optimizers = self._optimizers(*details)
         build = partial(self._record, source=source)
         return self._trains().machine((source,), batch, optimizers, build)
@@ -161,7 +161,7 @@ class OffPolicy(Fused, OffPolicyAlgorithm):
         return machine, data
 
     def _observations(self, machine: Machine, data: Any, next_ones: bool) -> th.Tensor:
-        """Give the observations of the present batch in the form of SB3's buffer.
+        """Return the observations of the present batch in the form of SB3's buffer.
 
         :param data: what the buffer's ``sample`` returned; None if it is read in place
         :param next_ones: whether to give the observations after the step

@@ -110,7 +110,7 @@ class OnPolicy(Fused, OnPolicyAlgorithm):
         program.minimise(loss, self.policy.optimizer, clip=program.scalar("max_grad_norm"))
 
     def _coefficients(self) -> dict[str, float]:
-        """Give the coefficients that :meth:`_minimise` uses."""
+        """Return the coefficients that :meth:`_minimise` uses."""
         return {name: getattr(self, name) for name in ("ent_coef", "vf_coef", "max_grad_norm")}
 
     @staticmethod

@@ -127,7 +127,7 @@ class Training:
         optimizers: Sequence[th.optim.Optimizer],
         build: Build,
     ) -> Machine:
-        """Give the machine for the next gradient step.
+        """Return the machine for the next gradient step.
 
         :param key: what the program depends on besides policy and optimizers
         :param batch: maximum batch size
@@ -136,7 +136,7 @@ class Training:
         :raises NotCovered: if programs cannot compute it
         """
         sparse = self._policy.sparse
-        capture = [o for o in optimizers if sparse.awaits(o) and sparse.wants_gradients(o)]
+        capture = [o for o in optimizers if sparse.needs_torch(o) and sparse.wants_gradients(o)]
         whole = (*key, th.get_num_threads(), *map(id, optimizers), -1, *map(id, capture))
         machine = self._machines.get(whole)
         if machine is None or machine.capacity < batch:
@@ -264,7 +264,7 @@ class Fused(BaseAlgorithm):
 
     @abstractmethod
     def _next_machine(self) -> Machine:
-        """Give the machine for the next gradient step.
+        """Return the machine for the next gradient step.
 
         :raises NotCovered: if programs cannot compute it
         """

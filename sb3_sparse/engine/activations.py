@@ -48,5 +48,5 @@ def tells_its_slope(module: nn.Module) -> bool:
 
 
 def number_of(module: nn.Module | None) -> tuple[int, float, float]:
-    """Give the number and the parameters of an activation in ``kernels.h``; None: the identity."""
+    """Return number and parameters of an activation in ``kernels.h``; None is the identity."""
     return (0, 0.0, 0.0) if module is None else ACTIVATIONS[type(module)](module)

@@ -75,12 +75,12 @@ def choose(root: nn.Module, layers: Iterable[LayerStorage], allowed: Container[s
     return [
         layer.name
         for chain in chains_of(root, (layer for layer in layers if layer.name in allowed))
-        if any(pays(layer.size, layer.nnz) for layer in chain)
+        if any(enough_for_chain(layer.size, layer.nnz) for layer in chain)
         for layer in chain
     ]
 
 
-def pays(size: int, nnz: int) -> bool:
+def enough_for_chain(size: int, nnz: int) -> bool:
     """Whether one layer gains enough for its whole chain to become sparse.
 
     :param size: connections of the dense layer

@@ -25,7 +25,7 @@ class Link(Protocol):
     bias: Any
 
     def live(self) -> tuple[Structure, th.Tensor]:
-        """Give the connections to compute with now, and their values."""
+        """Return the connections to compute with now, and their values."""
 
     def held(self) -> tuple[Structure, th.Tensor]:
         """As :meth:`live`, without a graph and while another thread may move connections."""
@@ -54,7 +54,7 @@ class Chain:
         return self.run(x, batch, False, False).view(*lead, self.rows)
 
     def flattened(self, x: th.Tensor) -> tuple[th.Tensor, int, th.Size]:
-        """Flatten the input to ``(batch, columns)``; give its batch and leading dimensions too.
+        """Flatten the input to ``(batch, columns)``; return batch and leading dimensions too.
 
         :raises UnsupportedError: unless it is float32 on the CPU and ``columns`` wide
         """

@@ -118,7 +118,7 @@ class Controller:
                 optimizer.register_state_dict_pre_hook(self._settle_moments),
                 optimizer.register_state_dict_post_hook(self._saved_form),
             ]
-            after = self._trust
+            after = self._accept_writes
             if not acts_elementwise(optimizer):
                 owned = [network.layers for network in self._owned_by(optimizer)]
                 check_masked(optimizer, chain.from_iterable(owned))
@@ -179,10 +179,10 @@ class Controller:
         for layer in self._sparse_layers(self.networks):
             layer.remask()
 
-    def notice(self) -> None:
+    def enforce_if_written(self) -> None:
         """As :meth:`enforce`, but only for weights that torch has seen written since."""
         for layer in self._sparse_layers(self.networks):
-            layer.notice()
+            layer.remask_if_written()
 
     def start(self, plan: Plan, soft_targets: bool, in_force: Callable[[], bool]) -> None:
         """Start moving masks.
@@ -229,25 +229,25 @@ class Controller:
                 self._warned = True
                 warn_of_no_plan(self.sparsity)
             for layer in network.sparse_layers:
-                layer.notice()
+                layer.remask_if_written()
                 layer.mask_gradient()  # which others may have written after our hooks
             if self.plan is not None:
                 self._update_if_due(network, self.plan)
             if self.weight_decay:
                 add_weight_decay(network.weights, self.weight_decay)
 
-    def _trust(self, optimizer: th.optim.Optimizer, args: object, kwargs: object) -> None:
+    def _accept_writes(self, optimizer: th.optim.Optimizer, args: object, kwargs: object) -> None:
         """Runs after the step of an optimizer that keeps weights at 0 whose gradient is 0."""
         for layer in self._sparse_layers(self._owned_by(optimizer)):
-            layer.trust()
+            layer.accept_writes()
 
     def _after_step(self, optimizer: th.optim.Optimizer, args: object, kwargs: object) -> None:
         """Runs after the step of an optimizer that writes to inactive weights."""
         for layer in self._sparse_layers(self._owned_by(optimizer)):
             layer.remask()
 
-    def awaits(self, optimizer: th.optim.Optimizer) -> bool:
-        """Whether the optimizer's next step needs more than the step, e.g. a mask update."""
+    def needs_torch(self, optimizer: th.optim.Optimizer) -> bool:
+        """Whether torch must take the optimizer's next step, e.g. because masks move at it."""
         return any(
             network.due(self.plan, network.clock + 1, self.progress)
             or (self.plan is None and not self._warned and network.denser)
@@ -260,7 +260,7 @@ class Controller:
         owned = self._owned_by(optimizer)
         return any(network.wants_gradients(self.plan, self.progress) for network in owned)
 
-    def passed(self, optimizer: th.optim.Optimizer) -> None:
+    def count_step(self, optimizer: th.optim.Optimizer) -> None:
         """Count a step that was taken in the optimizer's place."""
         for network in self._owned_by(optimizer):
             network.clock += 1

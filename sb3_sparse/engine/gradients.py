@@ -57,4 +57,4 @@ class GradientMask(ABC):
 
     @abstractmethod
     def take(self) -> DenseGradient | None:
-        """Hand over the dense gradient that the optimizer is about to apply; None: no gradient."""
+        """Take the dense gradient that the optimizer is about to apply; None: no gradient."""

@@ -174,7 +174,7 @@ class Inference:
         return self._leave() if room is None else [room.tensor(*at) for at in self._split(n)]
 
     def of_array(self, x: NDArray[Any]) -> list[NDArray[np.float32]] | None:
-        """As a call, for an array of observations of any type and number; gives arrays."""
+        """As a call, for an array of observations of any type and number; return arrays."""
         n, doubles = x.shape[0], DOUBLES.get(x.dtype)
         if doubles is None or not 0 < n <= MOST_INPUTS or x.size != n * self._columns or watching():
             return None
@@ -198,13 +198,13 @@ class Inference:
         return None if failed else room
 
     def _split(self, n: int) -> Iterator[tuple[tuple[int, int], int]]:
-        """Give the shape of each network's results, and where they begin."""
+        """Return the shape of each network's results, and where they begin."""
         return (
             ((n, width), n * place) for width, place in zip(self._widths, self._places, strict=True)
         )
 
     def _bound(self) -> Binding | None:
-        """Give the present addresses of the tensors; None if the kernels cannot read one."""
+        """Return the present addresses of the tensors; None if the kernels cannot read one."""
         for target in self._targets:
             if target.snapshot is not None:
                 return None  # it waits for the next copy
@@ -287,5 +287,5 @@ class Inference:
 
 
 def _tensors_of(layer: nn.Linear) -> tuple[th.Tensor | None, ...]:
-    """Give the weight, bias and mask of a layer."""
+    """Return the weight, bias and mask of a layer."""
     return layer.weight, layer.bias, layer._buffers.get(FLOAT_MASK_KEY)

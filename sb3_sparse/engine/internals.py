@@ -78,7 +78,7 @@ def become(module: nn.Module, cls: type[Module]) -> Module:
 
 
 def replace_data(parameter: nn.Parameter, data: th.Tensor) -> None:
-    """Give a Parameter other data, perhaps of another size; it stays the same object.
+    """Return a Parameter other data, perhaps of another size; it stays the same object.
 
     While a graph of an earlier pass is alive, autograd keeps the node that accumulates the
     gradient, and with it the old size. Setting ``data`` of another type makes it drop the node, so

@@ -26,7 +26,7 @@ class KeptInference:
         return KeptInference, ()
 
     def get(self, find: Callable[[], tuple[Paths, list[nn.Module]]]) -> Inference | None:
-        """Give the inference; None where the modules must be called one by one.
+        """Return the inference; None where the modules must be called one by one.
 
         :param find: gives the paths, and the modules around them from the outermost inwards; hooks
             of the outermost run in any case, those of the others would be skipped

@@ -117,7 +117,7 @@ class SparseLinear(nn.Linear):
             self.apply(lambda _: nn.Linear.reset_parameters(self))
 
     def live(self) -> tuple[Structure, th.Tensor]:
-        """Give the connections to compute with now, and their values."""
+        """Return the connections to compute with now, and their values."""
         if self.snapshot is not None:
             if th.equal(self.weight.detach(), self.snapshot.placed):
                 return self.snapshot.structure, self.snapshot.values
@@ -138,7 +138,7 @@ class SparseLinear(nn.Linear):
         return structure, values
 
     def dense(self) -> th.Tensor:
-        """Give the weights, 0 where inactive, shape ``(rows, columns)``."""
+        """Return the weights, 0 where inactive, shape ``(rows, columns)``."""
         structure, values = self.live()
         weight = values.detach().new_zeros(structure.shape[0] * structure.shape[1])
         weight[th.from_numpy(structure.flat)] = values.detach()

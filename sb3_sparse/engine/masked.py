@@ -148,14 +148,14 @@ class MaskedStorage(LayerStorage):
     def remask(self) -> None:
         if not self.full:
             clear(self.weight, self.float_mask)
-            self.trust()
+            self.accept_writes()
 
-    def notice(self) -> None:
+    def remask_if_written(self) -> None:
         weight = self.weight
         if (weight._version, weight.data_ptr()) != self._seen:
             self.remask()
 
-    def trust(self) -> None:
+    def accept_writes(self) -> None:
         weight = self.weight
         self._seen = weight._version, weight.data_ptr()
 

@@ -160,7 +160,7 @@ class SparseNetwork:
         )
 
     def take_gradients(self) -> dict[str, DenseGradient | None]:
-        """Hand over the dense gradients of the next step, by layer name."""
+        """Take the dense gradients of the next step, by layer name."""
         hooked = ((layer.name, layer.gradient) for layer in self.layers)
         return {name: gradient.take() for name, gradient in hooked if gradient is not None}
 

@@ -76,7 +76,7 @@ def acts_elementwise(optimizer: th.optim.Optimizer) -> bool:
 def _trial(
     optimizer: th.optim.Optimizer, start: th.Tensor, grad: Callable[[int], th.Tensor]
 ) -> tuple[th.Tensor, list[th.Tensor]]:
-    """Take three steps with a copy of the optimizer; give the parameter and its moments."""
+    """Take three steps with a copy of the optimizer; return the parameter and its moments."""
     parameter = nn.Parameter(start.clone())
     copied = copy.copy(optimizer)
     copied.state = defaultdict(dict)

@@ -271,7 +271,7 @@ def _followed(
 
 
 def to_sparse(layer: LayerStorage, optimizers: Sequence[th.optim.Optimizer]) -> LayerStorage:
-    """Move a linear layer to sparse storage; give others, and sparse ones, back unchanged."""
+    """Move a linear layer to sparse storage; return others, and sparse ones, unchanged."""
     if isinstance(layer, MaskedStorage) and type(layer.module) is nn.Linear:
         return SparseStorage(layer, optimizers)
     return layer

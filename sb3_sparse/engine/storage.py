@@ -88,14 +88,14 @@ class LayerStorage(ABC):
     def remask(self) -> None:
         """Set inactive weights to 0, in case the weight has been written."""
 
-    def notice(self) -> None:
+    def remask_if_written(self) -> None:
         """As :meth:`remask`, but only if torch has counted a write since, which is cheap to check.
 
         Torch does not count writes through ``.data`` or NumPy.
         """
         self.remask()
 
-    def trust(self) -> None:
+    def accept_writes(self) -> None:
         """Note that the writes counted so far kept inactive weights at 0."""
         return None
 
@@ -122,7 +122,7 @@ class LayerStorage(ABC):
 
     @abstractmethod
     def _dense_targets(self) -> Iterable[NDArray[np.float32]]:
-        """Give the dense weights of each target."""
+        """Return the dense weights of each target."""
 
     def check_mask(self, mask: th.Tensor) -> None:
         """Reject a saved mask of another sparsity.
@@ -185,7 +185,7 @@ class LayerStorage(ABC):
 
     @abstractmethod
     def saved_moment(self, moment: th.Tensor) -> th.Tensor:
-        """Give a moment of the weight in the form that a state_dict has."""
+        """Return a moment of the weight in the form that a state_dict has."""
 
     @abstractmethod
     def _move(

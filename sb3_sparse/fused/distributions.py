@@ -15,7 +15,7 @@ LOG_OF_ROOT_OF_TWO_PI = 0.5 * math.log(2.0 * math.pi)
 def squashed_gaussian(
     mean: Value, log_std: Value, noise: Value, epsilon: float
 ) -> tuple[Value, Value]:
-    """Sample a Gaussian and squash it by tanh; give the action and its log probability.
+    """Sample a Gaussian and squash it by tanh; return the action and its log probability.
 
     Example::
 

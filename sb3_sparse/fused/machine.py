@@ -116,7 +116,7 @@ class Machine:
         self.set_batch(self.inputs.load(rows))
 
     def index(self, name: str, batch: int) -> tuple[Any, int]:
-        """Give an int64 array for the row numbers of a batch, and its fixed address.
+        """Return an int64 array for the row numbers of a batch, and its fixed address.
 
         :param name: name of the index
         :param batch: batch size
@@ -136,7 +136,7 @@ class Machine:
             self.set({"1 / batch": 1 / batch, "batch - 1": batch - 1})
 
     def number(self, name: str) -> float:
-        """Give the number that the last run logged under ``name``."""
+        """Return the number that the last run logged under ``name``."""
         return float(self._view[self._logged[name]])
 
     def run(
@@ -156,7 +156,8 @@ class Machine:
         for minimised, step in zip(self.program.minimised, self.steps, strict=True):
             if not first <= step < last:
                 continue
-            if self.tables.ready(minimised) and not self.controller.awaits(minimised.optimizer):
+            by_kernels = self.tables.ready(minimised)
+            if by_kernels and not self.controller.needs_torch(minimised.optimizer):
                 continue
             self._go(first, step, failed)
             self._step_by_torch(minimised)
@@ -177,7 +178,7 @@ class Machine:
         """Count the optimizer steps within a range of operations."""
         for minimised, step in zip(self.program.minimised, self.steps, strict=True):
             if first <= step < last:
-                self.controller.passed(minimised.optimizer)
+                self.controller.count_step(minimised.optimizer)
                 self.tables.count(minimised)
 
     def _step_by_torch(self, minimised: Minimised) -> None:

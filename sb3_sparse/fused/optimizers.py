@@ -126,7 +126,7 @@ class Steps:
         )
 
     def state(self) -> list[Any]:
-        """Give a list that changes whenever the optimizer has other tensors for its moments."""
+        """Return a list that changes whenever the optimizer has other tensors for its moments."""
         if self.groups is None:
             return [None]
         state = self._optimizer.state
@@ -139,7 +139,7 @@ class Steps:
         return self.groups is not None and all(map(self._optimizer.state.get, self._moved))
 
     def moments(self, tensor: th.Tensor) -> Moments:
-        """Give the moments of a parameter."""
+        """Return the moments of a parameter."""
         assert self._known is not None
         state = self._optimizer.state[tensor]
         first, second = self._known.moments

@@ -101,7 +101,7 @@ class Recording:
         return self.scalars[name]
 
     def constant(self, number: float) -> Value:
-        """Give a constant as a value."""
+        """Return a constant as a value."""
         if number not in self.constants:
             self.constants[number] = Value(self, 1, False)
         return self.constants[number]

@@ -67,7 +67,7 @@ class Storage:
         self._rewritten = 0
 
     def state(self) -> list[object]:
-        """Give a list that changes whenever :meth:`of` would, apart from addresses."""
+        """Return a list that changes whenever :meth:`of` would, apart from addresses."""
         for key, (module, written) in list(self._own.items()):
             if not np.array_equal(_written(module), written):  # by a copy that torch does not count
                 del self._own[key]

@@ -155,7 +155,7 @@ class Tables:
         return 0 if place is None else self._grads.data_ptr() + 4 * place[0]
 
     def _address(self, tensor: th.Tensor | None) -> int:
-        """Give the address of a tensor, and hold the tensor so that it stays allocated."""
+        """Return the address of a tensor, and hold the tensor so that it stays allocated."""
         if tensor is None:
             return 0
         self._held.append(tensor)

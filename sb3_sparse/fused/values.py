@@ -24,7 +24,7 @@ class Recorder(Protocol):
         """Declare a number that each run sets."""
 
     def constant(self, number: float) -> Value:
-        """Give a constant as a value."""
+        """Return a constant as a value."""
 
     def value(self, number: Number) -> Value:
         """Convert a number to a value."""
@@ -79,7 +79,7 @@ class Value:
         return found
 
     def detach(self) -> Value:
-        """Give the same numbers without a gradient."""
+        """Return the same numbers without a gradient."""
         return self.view(0, self.features)
 
     def __getitem__(self, part: slice) -> Value:

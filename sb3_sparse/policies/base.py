@@ -184,7 +184,7 @@ class BaseSparsePolicy(FastPredict):
         if mode:
             self.sparse.begin_training(self)
         else:
-            self.sparse.notice()  # users may have written to weights
+            self.sparse.enforce_if_written()  # users may have written to weights
 
     def _switch(self, mode: bool) -> bool:
         same = super()._switch(mode)

@@ -92,7 +92,7 @@ class ActingModule(SparseModule, FastPredict):
         self._switch(mode)
         if not mode:  # users may have written to weights
             for layer in MaskedStorage.below(self):
-                layer.notice()
+                layer.remask_if_written()
 
     def _fast_actions(self, observations: Actions, deterministic: bool) -> Actions | None:
         if self._fast_forward is None:

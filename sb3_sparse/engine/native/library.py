@@ -43,7 +43,7 @@ class BatchArgument(ctypes.Structure):
 
 
 def bits_of(number: float) -> int:
-    """Give a double as the integer of the same bits, for structures filled as integers."""
+    """Return a double as the integer of the same bits, for structures filled as integers."""
     found: int = struct.unpack("q", struct.pack("d", number))[0]
     return found
 
