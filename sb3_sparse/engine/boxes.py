@@ -6,8 +6,8 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from sb3_sparse.engine.buffer import FLOAT, FloatBuffer
 from sb3_sparse.engine.native.library import library
-from sb3_sparse.engine.room import FLOAT, Room
 
 Array = NDArray[Any]
 CLIP, UNSCALE, SCALE = range(3)
@@ -46,6 +46,6 @@ class Bounds:
         shape = actions.shape
         if actions.dtype != FLOAT or (shape[1:] != self._shape and shape != self._shape):
             return None
-        room = Room(actions.size)
-        self._call(how, actions.size, self._size, *self._places, actions.tobytes(), room.memory)
-        return room.array(shape)
+        buffer = FloatBuffer(actions.size)
+        self._call(how, actions.size, self._size, *self._places, actions.tobytes(), buffer.memory)
+        return buffer.array(shape)

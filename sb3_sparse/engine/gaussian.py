@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import torch as th
 
+from sb3_sparse.engine.buffer import FloatBuffer
 from sb3_sparse.engine.native.library import library
-from sb3_sparse.engine.room import Room
 
 
 def sample_gaussian(
@@ -20,12 +20,12 @@ def sample_gaussian(
     :param noise: standard normal, shape ``(n, dim)``; None: the mean is the action
     """
     n, size = mean.shape
-    room = Room(n * size + n)
+    buffer = FloatBuffer(n * size + n)
     drawn = None if noise is None else noise.data_ptr()
     call = library().sb3_sparse_gaussian
-    if call(n, size, mean.data_ptr(), log_std.data_ptr(), drawn, room.memory):
+    if call(n, size, mean.data_ptr(), log_std.data_ptr(), drawn, buffer.memory):
         return None
-    return room.tensor((n, size), 0), room.tensor((n,), n * size)
+    return buffer.tensor((n, size), 0), buffer.tensor((n,), n * size)
 
 
 def sample_squashed(
@@ -41,9 +41,9 @@ def sample_squashed(
     :param noise: standard normal, shape ``(n, dim)``; None: the mean is the sample
     """
     size = mean.numel()
-    room = Room(2 * size)
+    buffer = FloatBuffer(2 * size)
     drawn = None if noise is None else noise.data_ptr()
     call = library().sb3_sparse_squashed
-    if call(size, *bounds, mean.data_ptr(), log_std.data_ptr(), drawn, room.memory):
+    if call(size, *bounds, mean.data_ptr(), log_std.data_ptr(), drawn, buffer.memory):
         return None
-    return room.tensor(mean.shape, 0), room.tensor(mean.shape, size)
+    return buffer.tensor(mean.shape, 0), buffer.tensor(mean.shape, size)

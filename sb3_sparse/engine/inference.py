@@ -20,6 +20,7 @@ from torch import nn
 from torch.compiler import is_compiling
 
 from sb3_sparse.engine.activations import ADJUSTABLE, number_of
+from sb3_sparse.engine.buffer import FloatBuffer
 from sb3_sparse.engine.chains import watched
 from sb3_sparse.engine.changes import patched
 from sb3_sparse.engine.internals import any_global_hook, watching
@@ -27,7 +28,6 @@ from sb3_sparse.engine.linear import TRIES, SparseLinear
 from sb3_sparse.engine.masked import FLOAT_MASK_KEY, MaskedStorage
 from sb3_sparse.engine.native.library import bits_of, library, readable, why_missing
 from sb3_sparse.engine.paths import Paths, modules_of, parts_of
-from sb3_sparse.engine.room import Room
 from sb3_sparse.engine.structure import Structure
 
 MOST_INPUTS = 16
@@ -170,18 +170,18 @@ class Inference:
             return self._leave()
         if not x.is_contiguous() or x.is_neg():
             x = x.contiguous().resolve_neg()
-        room = self._compute(n, doubles, x.data_ptr())
-        return self._leave() if room is None else [room.tensor(*at) for at in self._split(n)]
+        buffer = self._compute(n, doubles, x.data_ptr())
+        return self._leave() if buffer is None else [buffer.tensor(*at) for at in self._split(n)]
 
     def of_array(self, x: NDArray[Any]) -> list[NDArray[np.float32]] | None:
         """As a call, for an array of observations of any type and number; return arrays."""
         n, doubles = x.shape[0], DOUBLES.get(x.dtype)
         if doubles is None or not 0 < n <= MOST_INPUTS or x.size != n * self._columns or watching():
             return None
-        room = self._compute(n, doubles, x.tobytes())
-        return None if room is None else [room.array(*at) for at in self._split(n)]
+        buffer = self._compute(n, doubles, x.tobytes())
+        return None if buffer is None else [buffer.array(*at) for at in self._split(n)]
 
-    def _compute(self, n: int, doubles: bool, x: int | bytes) -> Room | None:
+    def _compute(self, n: int, doubles: bool, x: int | bytes) -> FloatBuffer | None:
         """Compute the networks' results, one after the other.
 
         :param n: number of inputs
@@ -192,10 +192,10 @@ class Inference:
         binding = self._bound() if on_cpu and not self.watched else None
         if binding is None:
             return None
-        room = Room(n * self._total)
+        buffer = FloatBuffer(n * self._total)
         steps = len(self._steps)
-        failed = self._call(binding.arguments, steps, n, doubles, x, room.memory)
-        return None if failed else room
+        failed = self._call(binding.arguments, steps, n, doubles, x, buffer.memory)
+        return None if failed else buffer
 
     def _split(self, n: int) -> Iterator[tuple[tuple[int, int], int]]:
         """Return the shape of each network's results, and where they begin."""

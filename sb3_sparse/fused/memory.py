@@ -54,23 +54,23 @@ class Memory:
                 size = value.features * TILE
                 self.places[value] = Place(at, 0, size if value.batched else 0)
                 at += size * (tiles if value.batched else 1)
-        room = _Room()
+        pool = _Pool()
         for number, operation in enumerate(operations):
             roots = {value.root for value in _values_of(operation)} & local
             for value in roots:
                 if uses[value][1] == number:
-                    self.places[value] = Place(at + room.take(value.features * TILE), -1, 0)
+                    self.places[value] = Place(at + pool.take(value.features * TILE), -1, 0)
             for value in roots:
                 if uses[value][2] == number:
-                    room.give(value.features * TILE, self.places[value].at - at)
+                    pool.give(value.features * TILE, self.places[value].at - at)
         self.places = {
-            value: place._replace(thread=room.size) if place.thread else place
+            value: place._replace(thread=pool.size) if place.thread else place
             for value, place in self.places.items()
         }
-        self.work = th.zeros(at + threads * room.size, dtype=th.float32, device="cpu")
+        self.work = th.zeros(at + threads * pool.size, dtype=th.float32, device="cpu")
 
 
-class _Room:
+class _Pool:
     """Hands out memory and takes it back."""
 
     def __init__(self) -> None:

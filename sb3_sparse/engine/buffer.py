@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 FLOAT = np.dtype(np.float32)
 
 
-class Room:
+class FloatBuffer:
     """Memory for float32 numbers that lives as long as any array or tensor of it.
 
     Creating it takes a tenth of the time of creating a tensor.
