@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 import sys
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from difflib import get_close_matches
 
 BETWEEN = {"sb3_sparse", "stable_baselines3", "sb3_contrib", "rl_zoo3", "optuna", "torch"}
@@ -21,6 +21,22 @@ def did_you_mean(name: object, known: Iterable[str]) -> str:
     by_spelling = {one.lower(): one for one in known}
     close = get_close_matches(str(name).lower(), by_spelling, n=1)
     return f" (did you mean {by_spelling[close[0]]!r}?)" if close else ""
+
+
+def check_choice(what: str, name: object, allowed: Collection[str], hint: str = "") -> None:
+    """Check that a name is one of the allowed ones.
+
+    :param what: kind of thing that has the name, e.g. ``"launcher"``
+    :param name: the name, of any type
+    :param allowed: all names, in the order to show them in
+    :param hint: what else the message shall say
+    :raises ConfigError: if the name is unknown
+    """
+    if not isinstance(name, str) or name not in allowed:
+        raise ConfigError(
+            f"unknown {what} {name!r}{did_you_mean(name, allowed)}; allowed are "
+            f"{', '.join(allowed)}{hint}"
+        )
 
 
 def command(*words: object) -> str:

@@ -59,7 +59,7 @@ def test_a_study_of_ones_own_is_run_looked_at_and_reported(tmp_path):
 def test_an_unknown_figure_is_known_before_anything_is_run(tmp_path, mistake):
     (tmp_path / "mine.yml").write_text(yaml.safe_dump({**CELLS, "figures": ["curve"]}))
     said = mistake("study", "run", "mine.yml", "--scale", "smoke")
-    assert "unknown figure 'curve'; allowed are " in said
+    assert "unknown figure 'curve' (did you mean 'curves'?); allowed are " in said
     assert not (tmp_path / "studies").exists()
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sb3_sparse.errors import ConfigError, did_you_mean
+from sb3_sparse.errors import check_choice
 
 FORMATS = ("c", "numpy", "onnx", "dense")
 
@@ -12,8 +12,4 @@ def check_format(to: object) -> None:
 
     :raises ConfigError: if ``to`` is not one of :data:`FORMATS`
     """
-    if to not in FORMATS:
-        raise ConfigError(
-            f"unknown export format {to!r}{did_you_mean(to, FORMATS)}; "
-            f"allowed are {', '.join(FORMATS)}"
-        )
+    check_choice("export format", to, FORMATS)

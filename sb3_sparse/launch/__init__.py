@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from sb3_sparse.errors import ConfigError, did_you_mean
+from sb3_sparse.errors import check_choice
 from sb3_sparse.launch.base import Launcher, Task, TaskResult, check_workers
 from sb3_sparse.launch.local import LocalLauncher
 from sb3_sparse.launch.ray import RayLauncher
@@ -27,9 +27,5 @@ def launcher_named(name: str, address: str | None = None) -> Launcher:
     :raises ConfigError: for an unknown name, or an address for a launcher other than Ray's
     :raises MissingExtra: for ``"ray"`` if Ray is not installed
     """
-    if name not in LAUNCHERS:
-        raise ConfigError(
-            f"unknown launcher {name!r}{did_you_mean(name, LAUNCHERS)}; "
-            f"allowed are {', '.join(LAUNCHERS)}"
-        )
+    check_choice("launcher", name, LAUNCHERS)
     return LAUNCHERS[name](address)

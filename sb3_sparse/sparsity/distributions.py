@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 
-from sb3_sparse.errors import ConfigError, did_you_mean
+from sb3_sparse.errors import ConfigError, check_choice
 from sb3_sparse.sparsity.numeric import as_float, is_number
 
 Shape = Sequence[int]
@@ -83,11 +83,7 @@ def check_distribution(distribution: str) -> str:
 
     :raises ConfigError: if no distribution has that name
     """
-    if not isinstance(distribution, str) or distribution not in DISTRIBUTIONS:
-        raise ConfigError(
-            f"unknown distribution {distribution!r}{did_you_mean(distribution, DISTRIBUTIONS)}; "
-            f"allowed are {', '.join(sorted(DISTRIBUTIONS))}"
-        )
+    check_choice("distribution", distribution, sorted(DISTRIBUTIONS))
     return distribution
 
 

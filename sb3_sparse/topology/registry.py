@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TypeVar
 
-from sb3_sparse.errors import ConfigError, did_you_mean
+from sb3_sparse.errors import ConfigError, check_choice
 from sb3_sparse.topology.base import TopologyMethod
 
 _METHODS: dict[str, TopologyMethod] = {}
@@ -43,10 +43,6 @@ def method_named(name: str) -> TopologyMethod:
 
     :raises ConfigError: if no method has that name
     """
-    if not isinstance(name, str) or name not in _METHODS:
-        raise ConfigError(
-            f"unknown method {name!r}{did_you_mean(name, _METHODS)}; allowed are "
-            f"{', '.join(method_names())}. A method of your "
-            "own is a subclass of sb3_sparse.topology.TopologyMethod with @register on it"
-        )
+    own = "a subclass of sb3_sparse.topology.TopologyMethod with @register on it"
+    check_choice("method", name, method_names(), f". A method of your own is {own}")
     return _METHODS[name]

@@ -7,9 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from sb3_sparse.errors import ConfigError
+from sb3_sparse.errors import ConfigError, check_choice
 from sb3_sparse.tuning.backend import FrozenTrial, optuna
-from sb3_sparse.tuning.choices import check_choice
 from sb3_sparse.tuning.spaces import Space
 
 BaseSampler = optuna.samplers.BaseSampler
@@ -28,7 +27,7 @@ def sampler_of(name: str, space: Space, seed: int) -> BaseSampler:
     :param name: ``"grid"``, ``"tpe"`` or ``"random"``
     :raises ConfigError: for another name, or for a grid over a space without choices
     """
-    check_choice("sampler", name, tuple(SAMPLERS))
+    check_choice("sampler", name, SAMPLERS)
     return SAMPLERS[name](space, seed)
 
 
@@ -68,7 +67,7 @@ def pruner_of(name: str, evaluations: int) -> BasePruner:
     :param evaluations: of a whole trial, over all its seeds
     :raises ConfigError: for another name
     """
-    check_choice("pruner", name, tuple(PRUNERS))
+    check_choice("pruner", name, PRUNERS)
     return PRUNERS[name](evaluations)
 
 

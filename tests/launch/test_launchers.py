@@ -14,7 +14,7 @@ import pytest
 from sb3_sparse.errors import ConfigError, MissingExtra
 from sb3_sparse.launch import LAUNCHERS, Task, launcher_named
 from sb3_sparse.studies import runner
-from sb3_sparse.tuning import search
+from sb3_sparse.tuning import tuner
 
 NAMES = list(LAUNCHERS)
 
@@ -73,7 +73,7 @@ def test_modules_are_imported_once_for_all_local_tasks_and_chance_is_their_own(
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="counts threads as Linux shows them")
-@pytest.mark.parametrize("function", [runner.FUNCTION, search.WORK])
+@pytest.mark.parametrize("function", [runner.FUNCTION, tuner.WORK])
 def test_modules_of_our_tasks_start_no_thread_that_a_fork_would_lose(function):
     code = (
         f"import {function.partition(':')[0]}, os, torch._dynamo\n"

@@ -117,7 +117,7 @@ def test_a_scales_schedule_is_for_masks_that_move(tmp_path):
         ({"figures": ["sensitivity"]}, "the figure sensitivity needs varies"),
         (
             {"common": {"algo": "a2c", "env_id": "CartPole-v1"}, "measures": {"snr": {"every": 9}}},
-            "snr is measured of DQN, SAC, PPO, got A2C",
+            "gradient_snr has no loss of A2C; supported are DQN, SAC, PPO",
         ),
         ({"trained": "no"}, "trained must be true or false, got 'no'"),
         ({"runs": {"method": "dense"}}, "runs must be a list of blocks"),

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from sb3_sparse.errors import ConfigError
+from sb3_sparse.errors import check_choice
 from sb3_sparse.files import write_csv
 from sb3_sparse.report.backend import (
     Axes,
@@ -97,11 +97,8 @@ def check_figures(names: Sequence[str]) -> None:
 
     :raises ConfigError: for an unknown name; lists those that are allowed
     """
-    unknown = [name for name in names if name not in FIGURES]
-    if unknown:
-        raise ConfigError(
-            f"unknown figure {', '.join(map(repr, unknown))}; allowed are {', '.join(FIGURES)}"
-        )
+    for name in names:
+        check_choice("figure", name, FIGURES)
 
 
 class Sheet:
