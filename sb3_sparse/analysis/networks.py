@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Mapping
 from typing import Any
 
@@ -17,7 +16,7 @@ from sb3_sparse.engine.prunable import PRUNABLE_TYPES, UNSUPPORTED_TYPES, Prunab
 from sb3_sparse.errors import UnsupportedError
 from sb3_sparse.policies.base import BaseSparsePolicy
 from sb3_sparse.policies.compiled import unwrapped
-from sb3_sparse.policies.modules import WHOLE_POLICY, memo_without_graphs
+from sb3_sparse.policies.modules import WHOLE_POLICY, copied
 from sb3_sparse.policies.registry import sparse_counterpart, supported_algorithms
 from sb3_sparse.policies.spec import NetworkSpec, in_target
 
@@ -108,14 +107,12 @@ def dense_twin(policy: BasePolicy) -> BasePolicy:
     gradients at inactive connections can be taken.
     """
     policy = unwrapped(policy)
-    memo: dict[Any, Any] = {**memo_without_graphs(policy), WHOLE_POLICY: True}
+    memo: dict[Any, Any] = {WHOLE_POLICY: True}
     for module in policy.modules():
         for value in vars(module).values():
             if isinstance(value, (th.optim.Optimizer, Controller)):
                 memo[id(value)] = _LeftOut()
-    twin = type(policy).__new__(type(policy))
-    memo[id(policy)] = twin
-    twin.__dict__.update(copy.deepcopy(policy.__dict__, memo))
+    twin = copied(policy, memo)
     make_plain(twin)
     for parameter in twin.parameters():
         parameter.requires_grad_(False)

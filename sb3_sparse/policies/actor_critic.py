@@ -23,7 +23,7 @@ ACTOR = ("mlp_extractor.policy_net", "action_net")
 CRITIC = ("mlp_extractor.value_net", "value_net")
 
 
-class NoSuchPart(UnsupportedError, AttributeError):
+class NoSuchAttribute(UnsupportedError, AttributeError):
     """A sparse policy lacks an attribute that an unsupported algorithm asks for."""
 
 
@@ -74,8 +74,8 @@ class SparseActorCriticPolicy(BaseSparsePolicy, ActorCriticPolicy):
             self._fast_forward["both"] = FastForward((ACTOR, CRITIC), acts)
 
     def _results(self, networks: str, obs: Any, extractor: str) -> list[th.Tensor] | None:
-        shortcut = self._fast_forward.get(networks)
-        return None if shortcut is None else shortcut.results(self, obs, extractor)
+        fast = self._fast_forward.get(networks)
+        return None if fast is None else fast.results(self, obs, extractor)
 
     def forward(
         self, obs: Any, deterministic: bool = False
@@ -138,7 +138,7 @@ class SparseActorCriticPolicy(BaseSparsePolicy, ActorCriticPolicy):
         except KeyError:
             pass
         if name == "lstm_actor":  # RecurrentPPO reads it before it checks the class
-            raise NoSuchPart(
+            raise NoSuchAttribute(
                 "RecurrentPPO has no sparse policy, since an LSTM cannot be masked; PPO, A2C and "
                 "TRPO have one"
             )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import inspect
 from collections.abc import Mapping
 from typing import Any, ClassVar, TypeVar
@@ -25,8 +24,7 @@ from sb3_sparse.policies.compiled import names_in, plain_names
 from sb3_sparse.policies.config import SparsityConfig
 from sb3_sparse.policies.extractors import choose_extractor, copied_modules
 from sb3_sparse.policies.fast_predict import FastPredict
-from sb3_sparse.policies.modules import WHOLE_POLICY, memo_without_graphs
-from sb3_sparse.policies.randomness import peek_seed
+from sb3_sparse.policies.modules import WHOLE_POLICY, copied
 from sb3_sparse.policies.report import SparsityReport, build_report
 from sb3_sparse.policies.spec import NetworkSpec
 from sb3_sparse.policies.storage import may_be_sparse
@@ -103,10 +101,9 @@ class BaseSparsePolicy(FastPredict):
             kwargs["features_extractor_class"] = self.extractor_class or choose_extractor(
                 observation_space, kwargs.get("normalize_images", True)
             )
-        drawn_seed = peek_seed()
+        seed = config.seed()  # before SB3 draws weights
         super().__init__(observation_space, action_space, lr_schedule, **kwargs)
         self.sparsity_config = config
-        seed = drawn_seed if config.mask_seed is None else config.mask_seed
         networks = build_networks(self, self.networks, config, seed, self._initial_gain)
         for network in networks:
             prefer_fused(network.optimizer)
@@ -126,12 +123,9 @@ class BaseSparsePolicy(FastPredict):
             self.use_kernels()  # without zeros it computes what stock SB3 does, to the bit
         self.sparse.attach()
 
-    def __deepcopy__(self: Sparse, memo: dict[int, Any]) -> Sparse:
-        memo.update(memo_without_graphs(self))
-        memo[WHOLE_POLICY] = True  # type: ignore[index]
-        twin = type(self).__new__(type(self))
-        memo[id(self)] = twin
-        twin.__dict__.update(copy.deepcopy(self.__dict__, memo))
+    def __deepcopy__(self: Sparse, memo: dict[Any, Any]) -> Sparse:
+        memo[WHOLE_POLICY] = True
+        twin = copied(self, memo)
         twin.sparse.attach()
         return twin
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
+import torch as th
 
 from sb3_sparse.engine.native.library import library
 from sb3_sparse.errors import ConfigError
@@ -99,6 +100,14 @@ class SparsityConfig:
         """Make a config of the keyword arguments that are its fields, and remove these."""
         names = [one.name for one in fields(cls) if one.name in kwargs]
         return cls(**{"sparsity": None, **{name: kwargs.pop(name) for name in names}})
+
+    def seed(self) -> int:
+        """The mask seed: if none is given, the next number of torch's generator, not advanced."""
+        if self.mask_seed is not None:
+            return self.mask_seed
+        generator = th.Generator()
+        generator.set_state(th.get_rng_state())
+        return int(th.randint(2**63 - 1, (), generator=generator))
 
     def by_network(self, sizes: Mapping[str, int]) -> dict[str, float]:
         """The sparsity of each network.

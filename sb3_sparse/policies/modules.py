@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from abc import abstractmethod
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
@@ -20,6 +20,7 @@ from sb3_sparse.policies.fast_predict import Actions, FastPredict
 from sb3_sparse.policies.training_mode import FastModeSwitch
 from sb3_sparse.policies.vectors import from_vector, to_vector
 
+Module = TypeVar("Module", bound=nn.Module)
 WHOLE_POLICY = "a whole policy is copied"
 """Key in the memo of ``copy.deepcopy``."""
 
@@ -28,10 +29,7 @@ class SparseModule(FastModeSwitch):
     """A module of a sparse policy that SB3 also uses by itself, as ``model.actor``."""
 
     def __deepcopy__(self, memo: dict[Any, Any]) -> Any:
-        memo.update(memo_without_graphs(self))
-        twin = type(self).__new__(type(self))
-        memo[id(self)] = twin
-        twin.__dict__.update(copy.deepcopy(self.__dict__, memo))
+        twin = copied(self, memo)
         if WHOLE_POLICY not in memo:  # else the policy's controller guards the masks
             vars(twin)["guard"] = Guard(MaskedStorage.below(twin))
         return twin
@@ -129,17 +127,21 @@ class PredictsByModule(FastPredict):
         return acting._fast_actions(observations, deterministic)
 
 
-def memo_without_graphs(root: nn.Module) -> dict[int, Any]:
-    """A memo for ``copy.deepcopy`` with action distributions cut off the graph of the last batch.
+def copied(root: Module, memo: dict[Any, Any]) -> Module:
+    """A deep copy in which action distributions are cut off the graph of the last batch.
 
     Torch cannot copy tensors that belong to a graph. Every forward pass sets them anew.
+
+    :param memo: as in ``copy.deepcopy``
     """
-    return {
-        id(value): _without_graph(value)
-        for module in root.modules()
-        for value in vars(module).values()
-        if isinstance(value, Distribution)
-    }
+    for module in root.modules():
+        for value in vars(module).values():
+            if isinstance(value, Distribution):
+                memo[id(value)] = _without_graph(value)
+    twin = type(root).__new__(type(root))
+    memo[id(root)] = twin
+    twin.__dict__.update(copy.deepcopy(root.__dict__, memo))
+    return twin
 
 
 def _without_graph(distribution: Distribution) -> Distribution:

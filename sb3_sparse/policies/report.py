@@ -27,18 +27,6 @@ COMPUTES = (SPARSE, MASKED, DENSE)
 """How a layer can compute."""
 
 
-def compute_of(is_sparse: bool, nnz: int, size: int) -> str:
-    """How a layer computes: :data:`SPARSE`, :data:`MASKED` or :data:`DENSE`.
-
-    :param is_sparse: whether it stores its active connections only
-    :param nnz: active connections
-    :param size: connections of the dense layer
-    """
-    if is_sparse:
-        return SPARSE
-    return MASKED if nnz < size else DENSE
-
-
 @dataclass(frozen=True)
 class LayerReport:
     """One layer in a report.
@@ -65,6 +53,41 @@ class LayerReport:
     dense_flops: int
     in_budget: bool
     compute: str
+
+    @classmethod
+    def of(
+        cls,
+        network: str,
+        name: str,
+        shape: tuple[int, ...],
+        *,
+        nnz: int,
+        biases: int = 0,
+        activated: bool = False,
+        positions: int = 0,
+        in_budget: bool = False,
+        is_sparse: bool = False,
+    ) -> LayerReport:
+        """Count parameters and FLOPs.
+
+        :param biases: number of biases
+        :param activated: whether an activation function follows
+        :param positions: output positions of a convolution, 1 for a linear layer; 0: not known
+        :param is_sparse: whether the layer stores only its active connections
+        """
+        size = math.prod(shape)
+        others = biases + (shape[0] if activated else 0)
+        return cls(
+            network,
+            name,
+            shape,
+            nnz,
+            parameters=nnz + biases,
+            flops=positions * (2 * nnz + others),
+            dense_flops=positions * (2 * size + others),
+            in_budget=in_budget,
+            compute=SPARSE if is_sparse else MASKED if nnz < size else DENSE,
+        )
 
     @property
     def size(self) -> int:
@@ -156,30 +179,27 @@ def build_report(policy: BasePolicy, networks: Iterable[SparseNetwork]) -> Spars
     layers = []
     counted: set[int] = set()
     for network in networks:
-        sparse = {layer.name for layer in network.layers if layer.is_sparse}
-        prunable: list[tuple[str, Prunable, tuple[int, ...], int, bool]] = [
-            (layer.name, layer.module, layer.shape, layer.nnz, True) for layer in network.layers
+        prunable: list[tuple[str, Prunable, tuple[int, ...], int, bool, bool]] = [
+            (one.name, one.module, one.shape, one.nnz, True, one.is_sparse)
+            for one in network.layers
         ]
         prunable += [
-            (name, module, tuple(module.weight.shape), module.weight.numel(), False)
+            (name, module, tuple(module.weight.shape), module.weight.numel(), False, False)
             for name, module in network.dense_layers
         ]
-        for name, module, shape, nnz, in_budget in prunable:
+        for name, module, shape, nnz, in_budget, is_sparse in prunable:
             counted.add(id(module.weight))
-            biases = 0 if module.bias is None else module.bias.numel()
-            units = shape[0] if id(module) in activated else 0
-            places = positions.get(id(module), 1)
             layers.append(
-                LayerReport(
-                    network=network.name,
-                    name=name,
-                    shape=shape,
+                LayerReport.of(
+                    network.name,
+                    name,
+                    shape,
                     nnz=nnz,
-                    parameters=nnz + biases,
-                    flops=places * (2 * nnz + biases + units),
-                    dense_flops=places * (2 * math.prod(shape) + biases + units),
+                    biases=0 if module.bias is None else module.bias.numel(),
+                    activated=id(module) in activated,
+                    positions=positions.get(id(module), 1),
                     in_budget=in_budget,
-                    compute=compute_of(name in sparse, nnz, math.prod(shape)),
+                    is_sparse=is_sparse,
                 )
             )
     return SparsityReport((*layers, *_other_matrices(policy, counted)))
@@ -204,20 +224,8 @@ def _other_matrices(policy: BasePolicy, counted: set[int]) -> list[LayerReport]:
         ):
             continue
         within = [n for n, spec in specs.items() if name.startswith(spec.roots)]
-        size = parameter.numel()
-        found.append(
-            LayerReport(
-                network=(within or list(specs))[0],
-                name=name,
-                shape=tuple(parameter.shape),
-                nnz=size,
-                parameters=size,
-                flops=0,
-                dense_flops=0,
-                in_budget=False,
-                compute=DENSE,
-            )
-        )
+        network, shape = (within or list(specs))[0], tuple(parameter.shape)
+        found.append(LayerReport.of(network, name, shape, nnz=parameter.numel()))
     return found
 
 

@@ -16,7 +16,7 @@ from sb3_sparse.engine.storage import LayerStorage
 from sb3_sparse.errors import ConfigError, CorruptStateError
 from sb3_sparse.policies.compiled import plain_names
 from sb3_sparse.policies.registry import registered
-from sb3_sparse.policies.report import LayerReport, SparsityReport, compute_of
+from sb3_sparse.policies.report import LayerReport, SparsityReport
 from sb3_sparse.policies.spec import NetworkSpec, in_target
 from sb3_sparse.zoo.positions import positions_of
 
@@ -78,20 +78,16 @@ def outline_of(state: Mapping[str, Any], image: tuple[int, ...] | None, where: s
             layer.set_mask(mask.bool().numpy())
             layers.append(layer)
             nnz = layer.nnz
-        biases = weight.shape[0] if name + BIAS in state else 0
-        units = weight.shape[0] if _activated(name, state, specs) else 0
-        places = positions.get(name, 1 if weight.dim() == 2 else 0)
         reports.append(
-            LayerReport(
-                network=network,
-                name=name,
-                shape=tuple(weight.shape),
+            LayerReport.of(
+                network,
+                name,
+                tuple(weight.shape),
                 nnz=nnz,
-                parameters=nnz + biases,
-                flops=places * (2 * nnz + biases + units),
-                dense_flops=places * (2 * weight.numel() + biases + units),
+                biases=weight.shape[0] if name + BIAS in state else 0,
+                activated=_activated(name, state, specs),
+                positions=positions.get(name, 1 if weight.dim() == 2 else 0),
                 in_budget=mask is not None,
-                compute=compute_of(False, nnz, weight.numel()),
             )
         )
     _fill(root)
