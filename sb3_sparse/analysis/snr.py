@@ -7,8 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.running_mean_std import RunningMeanStd
 from torch import nn
 from torch.func import functional_call, grad, vmap
 
@@ -88,35 +90,6 @@ class GradientSNR:
     def __str__(self) -> str:
         rows = "\n".join(f"{name}: {value:.4g}" for name, value in self.values().items())
         return f"{rows}\n(over {self.samples} samples)"
-
-
-class RunningStatistics:
-    """Mean and standard deviation over samples that arrive in chunks, in float64.
-
-    Source: Chan, Golub and LeVeque 1983, *Algorithms for computing the sample variance*.
-    """
-
-    def __init__(self) -> None:
-        self.count = 0
-        self.mean = th.zeros((), dtype=th.float64)
-        self.squares = th.zeros((), dtype=th.float64)
-        """Sum of squared distances from the mean."""
-
-    def add(self, values: th.Tensor) -> None:
-        """Add samples, along the first dimension."""
-        values, n = values.to(th.float64), len(values)
-        mean = values.mean(dim=0)
-        apart = mean - self.mean.to(mean.device)
-        total = self.count + n
-        self.squares = self.squares.to(mean.device) + (values - mean).square().sum(dim=0)
-        self.squares = self.squares + apart.square() * (self.count * n / total)
-        self.mean = self.mean.to(mean.device) + apart * (n / total)
-        self.count = total
-
-    @property
-    def snr(self) -> th.Tensor:
-        """``|mean| / (population std + 1e-10)`` of each number."""
-        return self.mean.abs() / ((self.squares / self.count).sqrt() + 1e-10)
 
 
 class _OfSample(nn.Module):
@@ -207,15 +180,21 @@ def gradient_snr(
             made = losses(model, twin, batch)
         for loss in made:
             trained = [name for network in loss.networks for name in names[network]]
-            statistics = {name: RunningStatistics() for name in trained}
+            statistics: dict[str, RunningMeanStd] = {}
             for gradients in per_sample_gradients(twin, loss, trained, chunk):
                 for name, each in gradients.items():
-                    statistics[name].add(each)
+                    one = statistics.setdefault(name, RunningMeanStd(0.0, each.shape[1:]))
+                    one.update(each.double().cpu().numpy())
             for network in loss.networks:
-                snr = {name: statistics[name].snr.flatten().cpu() for name in names[network]}
+                snr = {name: _ratios(statistics[name]) for name in names[network]}
                 results[network] = _means(network, snr, masks)
     in_order = tuple(results[name] for name in names)
     return GradientSNR(in_order, len(pytree.tree_leaves(batch._asdict())[0]))
+
+
+def _ratios(gradients: RunningMeanStd) -> th.Tensor:
+    ratios = np.abs(gradients.mean) / (np.sqrt(gradients.var) + 1e-10)
+    return th.from_numpy(ratios).flatten()
 
 
 def _means(network: str, snr: Mapping[str, th.Tensor], masks: Mapping[str, Any]) -> NetworkSNR:

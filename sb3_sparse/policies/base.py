@@ -28,12 +28,12 @@ from sb3_sparse.policies.modules import WHOLE_POLICY, copied
 from sb3_sparse.policies.report import SparsityReport, build_report
 from sb3_sparse.policies.spec import NetworkSpec
 from sb3_sparse.policies.storage import may_be_sparse
-from sb3_sparse.policies.vectors import from_vector, to_vector
+from sb3_sparse.policies.vectors import DenseVectors
 
 Sparse = TypeVar("Sparse", bound="BaseSparsePolicy")
 
 
-class BaseSparsePolicy(FastPredict):
+class BaseSparsePolicy(DenseVectors, FastPredict):
     """Base class of sparse policies, to be put before a policy class of SB3.
 
     A subclass declares where its networks are; this class makes them sparse and keeps them so.
@@ -186,16 +186,8 @@ class BaseSparsePolicy(FastPredict):
             check_places(self, self.sparse.layers)
         return same
 
-    def parameters_to_vector(self) -> np.ndarray[Any, Any]:
-        """As in SB3; weights are dense in every storage, 0 where inactive."""
-        return to_vector(self)
-
     def load_from_vector(self, vector: np.ndarray[Any, Any]) -> None:
-        """As in SB3; inactive connections stay 0, and a warning counts the values dropped.
-
-        :raises ConfigError: if the vector has another length
-        """
-        from_vector(self, vector)
+        super().load_from_vector(vector)
         for layer in self.sparse.layers:
             layer.settle_targets(soft=False)
 
@@ -204,7 +196,10 @@ class BaseSparsePolicy(FastPredict):
     ) -> Any:
         """As in torch; the weights of a dense policy, and of its target networks, are masked."""
         state_dict = plain_names(state_dict)
-        self._check_masks(state_dict)
+        for layer in self.sparse.layers:  # before anything is loaded
+            mask = state_dict.get(f"{layer.name}.weight_mask")
+            if mask is not None:
+                layer.check_mask(mask)
         named = names_in(self, state_dict)
         incompatible = super().load_state_dict(named, strict=strict, assign=assign)
         if not any(key.endswith(".weight_mask") for key in state_dict):
@@ -212,13 +207,6 @@ class BaseSparsePolicy(FastPredict):
                 layer.mask_targets()
         self.sparse.choose_storage(self)  # pruning may have made layers sparse
         return incompatible
-
-    def _check_masks(self, state_dict: Mapping[str, Any]) -> None:
-        """Refuse, before anything is loaded, masks of another sparsity."""
-        for layer in self.sparse.layers:
-            mask = state_dict.get(f"{layer.name}.weight_mask")
-            if mask is not None:
-                layer.check_mask(mask)
 
     def get_extra_state(self) -> th.Tensor:
         """Mask seed, then clock and number of mask updates of each network, then a 0; int64.

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from functools import partial
 from importlib.util import find_spec
-from typing import Any, NoReturn
+from typing import Any
 
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import Schedule
 
 from sb3_sparse.engine.internals import become
-from sb3_sparse.errors import MissingExtra, UnsupportedError
+from sb3_sparse.errors import MissingExtra
 from sb3_sparse.policies.actor_critic import SparseActorCriticPolicy
 from sb3_sparse.policies.base import BaseSparsePolicy
 from sb3_sparse.policies.critics import SparseCritic, SparseCriticsMixin
@@ -22,7 +21,6 @@ from sb3_sparse.policies.modules import ActingModule, PredictsByModule
 from sb3_sparse.policies.registry import (
     register_policy,
     reject,
-    supported_algorithms,
     variants_of,
 )
 from sb3_sparse.policies.sac import GAUSSIAN_ACTING, GAUSSIAN_ACTOR, TWIN_CRITIC, sac_passes
@@ -203,23 +201,5 @@ class SparseCrossQPolicy(SparseCriticsMixin, CrossQPolicy):
 
 
 register_policy(TRPO, told_by="cg_max_steps")(SparseActorCriticPolicy)
-
-
-class _NoSparsePolicy(BasePolicy):
-    """Stands in for the sparse policy of an algorithm that has none, and raises an error."""
-
-    algorithm: str
-
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        raise UnsupportedError(
-            f"{self.algorithm} has no sparse policy; supported are "
-            f"{', '.join(supported_algorithms())}"
-        )
-
-    def _predict(self, observation: Any, deterministic: bool = False) -> NoReturn:
-        raise AssertionError("never built")
-
-
 for _algorithm in (ARS, MaskablePPO, RecurrentPPO):
-    _name = _algorithm.__name__
-    reject(_algorithm, type(f"No{_name}Policy", (_NoSparsePolicy,), {"algorithm": _name}))
+    reject(_algorithm)

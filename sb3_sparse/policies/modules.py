@@ -6,7 +6,6 @@ import copy
 from abc import abstractmethod
 from typing import Any, ClassVar, TypeVar
 
-import numpy as np
 import torch as th
 from stable_baselines3.common.distributions import Distribution
 from torch import nn
@@ -18,14 +17,14 @@ from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.policies.fast_forward import FastForward
 from sb3_sparse.policies.fast_predict import Actions, FastPredict
 from sb3_sparse.policies.training_mode import FastModeSwitch
-from sb3_sparse.policies.vectors import from_vector, to_vector
+from sb3_sparse.policies.vectors import DenseVectors
 
 Module = TypeVar("Module", bound=nn.Module)
 WHOLE_POLICY = "a whole policy is copied"
 """Key in the memo of ``copy.deepcopy``."""
 
 
-class SparseModule(FastModeSwitch):
+class SparseModule(DenseVectors, FastModeSwitch):
     """A module of a sparse policy that SB3 also uses by itself, as ``model.actor``."""
 
     def __deepcopy__(self, memo: dict[Any, Any]) -> Any:
@@ -49,17 +48,6 @@ class SparseModule(FastModeSwitch):
         make_plain(twin)
         data = twin._get_constructor_parameters()
         th.save({"state_dict": twin.state_dict(), "data": data}, path)
-
-    def parameters_to_vector(self) -> np.ndarray[Any, Any]:
-        """As in SB3; weights are dense in every storage, 0 where inactive."""
-        return to_vector(self)
-
-    def load_from_vector(self, vector: np.ndarray[Any, Any]) -> None:
-        """As in SB3; inactive connections stay 0, and a warning counts the values dropped.
-
-        :raises ConfigError: if the vector has another length
-        """
-        from_vector(self, vector)
 
 
 class ActingModule(SparseModule, FastPredict):

@@ -12,7 +12,7 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from sb3_sparse.errors import ConfigError
+from sb3_sparse.errors import ConfigError, UnsupportedError
 
 if TYPE_CHECKING:  # imported when an algorithm is, not when one is named
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -140,17 +140,20 @@ def variants_of(policy: type[Policy], *prefixes: str) -> list[type[Policy]]:
     return list(found.values())
 
 
-def _add_aliases(algorithm: type[BaseAlgorithm], policies: Mapping[str, type[BasePolicy]]) -> None:
+def _add_aliases(algorithm: type[BaseAlgorithm], policies: Mapping[str, Any]) -> None:
     for prefix, policy in policies.items():
         algorithm.policy_aliases[f"Sparse{prefix}Policy"] = policy
 
 
-def reject(algorithm: type[BaseAlgorithm], policy: type[BasePolicy]) -> None:
-    """Give an algorithm without a sparse policy one that raises an error instead.
+def reject(algorithm: type[BaseAlgorithm]) -> None:
+    """Let ``"SparsePolicy"`` raise an error in an algorithm that has no sparse policy."""
 
-    :param policy: raises when it is made
-    """
-    _add_aliases(algorithm, dict.fromkeys(("", "Mlp", "Cnn", "MultiInput"), policy))
+    def no_policy(*args: Any, **kwargs: Any) -> Any:
+        raise UnsupportedError(
+            f"{algorithm.__name__} has no sparse policy; supported are {', '.join(registered())}"
+        )
+
+    _add_aliases(algorithm, dict.fromkeys(("", "Mlp", "Cnn", "MultiInput"), no_policy))
     _rejected.append(algorithm)
 
 
