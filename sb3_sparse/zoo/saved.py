@@ -158,7 +158,9 @@ def find_saved(
     arguments = arguments_of(folder) if path.is_dir() or is_run(folder) else {}
     env_id, packages = environment_in({**arguments, "env": env_id or arguments.get("env")})
     packages = package_names([*packages, *gym_packages])
-    import_packages(packages)
+    wanted = algo or arguments.get("algo")
+    if wanted is not None and wanted not in loadable_algorithms():
+        import_packages(packages)
     params = params_of(folder, arguments["env"]) if arguments else None
     if path.is_dir():
         path = model_in(folder, arguments["env"], best)

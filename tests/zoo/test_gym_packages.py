@@ -133,6 +133,15 @@ def test_looking_into_a_model_imports_nothing(trained):
     assert "tiny_envs" not in sys.modules
 
 
+def test_a_model_is_exported_where_the_package_of_its_environment_is_missing(
+    trained, package, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(sys, "path", [one for one in sys.path if one != str(package)])
+    export_policy(find_saved(trained).load(), tmp_path / "policy", "numpy")
+    with pytest.raises(ConfigError, match="there is no package 'tiny_envs'"):
+        enjoy(trained, episodes=1)
+
+
 def test_a_zip_elsewhere_takes_the_package_from_the_environments_id(trained, tmp_path):
     elsewhere = tmp_path / "model.zip"
     elsewhere.write_bytes((trained / "Tiny-v0.zip").read_bytes())
