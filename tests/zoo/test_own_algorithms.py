@@ -8,10 +8,13 @@ import sys
 
 import pytest
 import stable_baselines3
+import torch as th
 import yaml
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 from sb3_sparse import SAC, SparseSACPolicy, register_policy, sparsify
-from sb3_sparse.analysis import flops
+from sb3_sparse.analysis import Loss, flops, gradient_snr, register_losses
+from sb3_sparse.analysis.losses import _losses
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.export import export_policy
 from sb3_sparse.policies import registry
@@ -83,6 +86,34 @@ def test_its_gradient_step_is_counted(folder):
     layers = {layer.name: layer for layer in report.layers}
     first = layers["actor.first.0"]
     assert first.step == (2 + 2) * 16 * first.forward  # two forward and one backward pass
+
+
+def test_its_snr_is_measured_once_it_has_losses(folder):
+    model = find_saved(folder).load()
+    space = model.observation_space
+    observations = th.rand(8, *space.shape)
+    batch = ReplayBufferSamples(
+        observations, th.rand(8, 1), observations, th.zeros(8, 1), th.rand(8, 1)
+    )
+    with pytest.raises(ConfigError, match="gradient_snr has no loss of CautiousSAC"):
+        gradient_snr(model, batch)
+
+    def of_actor(policy, sample):
+        mean, log_std, _ = policy.actor.get_action_dist_params(sample["observations"][None])
+        return (mean + log_std).sum()
+
+    def of_critic(policy, sample):
+        return policy.critic(sample["observations"][None], sample["actions"][None])[0].sum()
+
+    @register_losses(type(model))
+    def losses(model, policy, batch):
+        samples = dict(observations=batch.observations, actions=batch.actions)
+        return [Loss(("actor",), samples, of_actor), Loss(("critic",), samples, of_critic)]
+
+    try:
+        assert gradient_snr(model, batch)["actor"].active > 0
+    finally:
+        _losses.pop(type(model))
 
 
 def test_it_is_exported_and_a_sparser_twin_of_it_is_made(folder, tmp_path):
