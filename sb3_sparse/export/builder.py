@@ -79,7 +79,9 @@ class GraphBuilder:
             found.append(node.inputs[0])
         return found
 
-    def refusal(self, module: nn.Module, why: str = "", allowed: str = ALLOWED) -> UnsupportedError:
+    def unsupported(
+        self, module: nn.Module, why: str = "", allowed: str = ALLOWED
+    ) -> UnsupportedError:
         """Return the error for a module that cannot be exported."""
         kind, name = type(module).__name__, self.names.get(id(module), "")
         called = f"{name} ({kind})" if name else kind

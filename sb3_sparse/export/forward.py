@@ -39,7 +39,7 @@ def trace_forward(
     try:
         graph = _Leaves().trace(module)
     except Exception as error:  # whatever a forward does that cannot be traced
-        raise builder.refusal(module, f"its forward cannot be traced ({error})") from error
+        raise builder.unsupported(module, f"its forward cannot be traced ({error})") from error
     values: dict[fx.Node, int] = {}
     observation: fx.Node | None = None
     sizes: set[fx.Node] = set()
@@ -65,7 +65,7 @@ def trace_forward(
         elif node.op in ("call_function", "call_method") and first is not None:
             found = _call(builder, walk, node, values, sizes)
         if found is None:
-            raise builder.refusal(module, f"its forward {_description(node)}")
+            raise builder.unsupported(module, f"its forward {_description(node)}")
         values[node] = found
     raise AssertionError("a graph has an output")
 

@@ -155,7 +155,6 @@ class Weighted(Node):
         return {"weight": self.rows, "bias": self.bias[:, None]}
 
 
-@dataclass(frozen=True, eq=False)
 class Linear(Weighted):
     """``weight @ x + bias``."""
 
@@ -196,28 +195,24 @@ class MaxPool(Node):
         return {name: np.array(getattr(self, name)) for name in ("kernel", "stride", "padding")}
 
 
-@dataclass(frozen=True, eq=False)
 class Flatten(Node):
     """All units and places as one vector."""
 
     op = "flatten"
 
 
-@dataclass(frozen=True, eq=False)
 class Add(Node):
     """The sum of two values."""
 
     op = "add"
 
 
-@dataclass(frozen=True, eq=False)
 class Multiply(Node):
     """The product of two values, element by element."""
 
     op = "multiply"
 
 
-@dataclass(frozen=True, eq=False)
 class Concat(Node):
     """The concatenation of values along the units."""
 
@@ -282,7 +277,6 @@ class Argmax(Node):
         return {"splits": np.cumsum(self.sizes)[:-1]}
 
 
-@dataclass(frozen=True, eq=False)
 class Positive(Node):
     """1 for positive units, 0 for others."""
 

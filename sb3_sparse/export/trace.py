@@ -76,26 +76,26 @@ class Tracer(GraphBuilder):
                 value = self.walk(child, value)
             return value
         if type(module).__module__.startswith("torch.nn.modules."):
-            raise self.refusal(module)
+            raise self.unsupported(module)
         return trace_forward(self, self.walk, module, value)
 
     def _flatten(self, module: nn.Flatten, value: int) -> int:
         shape = self.shape_of(value)
         axes = (module.start_dim, module.end_dim)
         if axes not in ((1, -1), (1, len(shape))):
-            raise self.refusal(module, f"it is of the axes {axes}", "the axes 1 to -1")
+            raise self.unsupported(module, f"it is of the axes {axes}", "the axes 1 to -1")
         if len(shape) == 1:
             return value
         return self.add(Flatten((value,), (int(np.prod(shape)),)))
 
     def _linear(self, module: nn.Linear, value: int) -> int:
         if len(self.shape_of(value)) != 1:
-            raise self.refusal(
+            raise self.unsupported(
                 module, f"it takes a value of shape {self.shape_of(value)}", "vectors: flatten it"
             )
         weight, bias = _arrays(module)
         if weight.shape[1:] != self.shape_of(value):
-            raise self.refusal(
+            raise self.unsupported(
                 module,
                 f"of {weight.shape[1]} features it gets {self.shape_of(value)[0]}, so the policy "
                 "does more than its modules show",
@@ -109,7 +109,7 @@ class Tracer(GraphBuilder):
             or module.padding_mode != "zeros"
             or isinstance(module.padding, str)
         ):
-            raise self.refusal(
+            raise self.unsupported(
                 module,
                 f"it is {module}",
                 "convolutions without groups, dilation and named padding, with zeros around",
@@ -121,7 +121,7 @@ class Tracer(GraphBuilder):
 
     def _max_pool(self, module: nn.MaxPool2d, value: int) -> int:
         if _pair(module.dilation) != (1, 1) or module.return_indices or module.ceil_mode:
-            raise self.refusal(
+            raise self.unsupported(
                 module, f"it is {module}", "those without dilation, indices and ceil_mode"
             )
         kernel, stride = _pair(module.kernel_size), _pair(module.stride)
@@ -133,7 +133,7 @@ class Tracer(GraphBuilder):
     def _layer_norm(self, module: nn.LayerNorm, value: int) -> int:
         shape = self.shape_of(value)
         if tuple(module.normalized_shape) != shape or len(shape) > 1:
-            raise self.refusal(
+            raise self.unsupported(
                 module, f"it takes a value of shape {shape}", "vectors, normalised as a whole"
             )
         value = self.add(Standardize((value,), shape, float(module.eps)))
@@ -146,7 +146,7 @@ class Tracer(GraphBuilder):
     def _norm(self, module: Any, mean: str, var: str, weight: str, value: int) -> int:
         """Translate batch normalisation, which uses its running statistics in evaluation."""
         if getattr(module, mean) is None:
-            raise self.refusal(module, "it keeps no statistics", "those that keep them")
+            raise self.unsupported(module, "it keeps no statistics", "those that keep them")
         centre = _array(getattr(module, mean)).astype(np.float64)
         deviation = np.sqrt(_array(getattr(module, var)).astype(np.float64) + module.eps)
         shape = self.shape_of(value)

@@ -90,7 +90,7 @@ class TrainingLog(Watch):
         return True
 
     def status(self) -> str:
-        """The return of the last episodes, the sparsity, and environment steps a second.
+        """The return of the last episodes, the sparsity, and environment steps per second.
 
         The time of evaluations counts, as in SB3's own ``time/fps``.
         """
@@ -101,7 +101,7 @@ class TrainingLog(Watch):
             text += f", sparsity {policy.sparse.sparsity:.2%}"
         seconds = (time.time_ns() - self.model.start_time) / 1e9
         done = timesteps_since_start(self.model)
-        return f"{text}, {done / seconds:.0f} steps a second" if done else text
+        return f"{text}, {done / seconds:.0f} steps/s" if done else text
 
 
 def counting(tell: Callable[[int], None]) -> Callable[[dict[str, Any], dict[str, Any]], None]:
