@@ -253,7 +253,7 @@ def test_normalised_and_stacked_dicts(tmp_path):
     expected, _ = model.predict(normalised.normalize_obs(raw), deterministic=True)
     np.testing.assert_allclose(policy(raw), expected, atol=1e-5)
     other = VecNormalize(DummyVecEnv([lambda: Task(dicts(1), TORQUE)]))
-    with pytest.raises(ConfigError, match=r"a dict of shapes .*\(7,\).*those in Dict"):
+    with pytest.raises(ConfigError, match=r"shape \(7,\).*but those here have shape"):
         export_policy(model, tmp_path / "other", "c", vecnormalize=other)
     stacked = VecFrameStack(VecNormalize(DummyVecEnv([lambda: Task(space, TORQUE)])), 3)
     model = make("PPO", stacked)

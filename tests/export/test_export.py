@@ -380,7 +380,7 @@ def test_dense_zips_keep_policy_classes_of_ones_own(tmp_path):
     export_policy(PPO(OwnPolicy, "CartPole-v1", device="cpu"), tmp_path / "own", "dense")
     assert type(PPO.load(tmp_path / "own.zip").policy) is OwnPolicy
     model = PPO(OwnSparsePolicy, "CartPole-v1", device="cpu", policy_kwargs=dict(sparsity=0.5))
-    with pytest.raises(UnsupportedError, match="OwnSparsePolicy is a sparse policy of your own"):
+    with pytest.raises(UnsupportedError, match="OwnSparsePolicy is your own sparse policy"):
         export_policy(model, tmp_path / "sparse", "dense")
 
 
