@@ -71,36 +71,23 @@ def pruner_of(name: str, evaluations: int) -> BasePruner:
     return PRUNERS[name](evaluations)
 
 
-def _none(evaluations: int) -> BasePruner:
-    return optuna.pruners.NopPruner()
-
-
-def _median(evaluations: int) -> BasePruner:
-    return optuna.pruners.MedianPruner(STARTUP_TRIALS, n_warmup_steps=evaluations // 3)
-
-
-def _halving(evaluations: int) -> BasePruner:
-    return optuna.pruners.SuccessiveHalvingPruner(
-        min_resource=_first_rung(evaluations), reduction_factor=REDUCTION
-    )
-
-
-def _hyperband(evaluations: int) -> BasePruner:
-    least = _first_rung(evaluations)
-    return optuna.pruners.HyperbandPruner(
-        min_resource=least, max_resource=max(evaluations, least), reduction_factor=REDUCTION
-    )
-
-
 def _first_rung(evaluations: int) -> int:
     return max(1, evaluations // REDUCTION**2)
 
 
 PRUNERS: dict[str, Callable[[int], BasePruner]] = {
-    "none": _none,
-    "median": _median,
-    "halving": _halving,
-    "hyperband": _hyperband,
+    "none": lambda _: optuna.pruners.NopPruner(),
+    "median": lambda evaluations: optuna.pruners.MedianPruner(
+        STARTUP_TRIALS, n_warmup_steps=evaluations // 3
+    ),
+    "halving": lambda evaluations: optuna.pruners.SuccessiveHalvingPruner(
+        min_resource=_first_rung(evaluations), reduction_factor=REDUCTION
+    ),
+    "hyperband": lambda evaluations: optuna.pruners.HyperbandPruner(
+        min_resource=_first_rung(evaluations),
+        max_resource=max(1, evaluations),
+        reduction_factor=REDUCTION,
+    ),
 }
 
 
