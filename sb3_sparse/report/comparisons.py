@@ -81,7 +81,7 @@ def by_distribution(results: Results, family: str) -> Sides:
         has("erk"),
         has("uniform"),
         _all_but("distribution"),
-        "no runs that differ in nothing but ERK and uniform",
+        "no runs that differ only in ERK and uniform",
     )
 
 
@@ -108,7 +108,7 @@ def by_weight_decay(results: Results, family: str) -> Sides:
         lambda run: 0 < decay(run) <= SMALL_DECAY * (1 + 1e-9),
         lambda run: decay(run) == 0,
         _all_but("weight_decay"),
-        "no runs that differ in nothing but a small weight decay and none",
+        "no runs that differ only in a small weight decay and none",
     )
 
 

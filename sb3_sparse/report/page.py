@@ -31,7 +31,7 @@ INTERVALS = (
     "bootstrap is much too narrow. Each environment, or environment and sparsity, is a stratum. "
     f"A stratum with fewer than {LEAST_SEEDS} seeds of either side does not count, and without "
     "any there is no verdict. Several findings are tested at 95 % each, with no correction. "
-    '"Not enough data" is also said when the interval decides nothing.'
+    '"Not enough data" is also the verdict if the interval decides nothing.'
 )
 
 
@@ -169,8 +169,8 @@ def _diverged(content: Content) -> list[str]:
         return []
     texts = [f"{one.folder}: {one.reason}" for one in content.diverged]
     warning = (
-        "Training of these ended in NaN. They have no score, so no figure, table or verdict holds "
-        "them: what is averaged are the other seeds, which flatters settings that diverge."
+        "The training of these runs ended in NaN. They have no score, so figures, tables and "
+        "verdicts average the other seeds only, which flatters settings that diverge."
     )
     return [html.section("Diverged", html.paragraph(warning), html.listing(texts))]
 

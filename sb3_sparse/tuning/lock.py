@@ -1,4 +1,4 @@
-"""A lock that every storage has: a study of a name of its own."""
+"""A lock that works in every storage: a study with a name of its own."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ PAUSE = 0.2
 def locked(storage: BaseStorage, name: str) -> Iterator[Callable[[], None]]:
     """Keep all other processes, on any machine, from filling a search within the block.
 
-    The one step that every storage takes for a single process alone is to make a study of a new
-    name. So the lock is such a study, and is deleted at the end.
+    Making a study of a new name is the one step that every storage lets only one process take. The
+    lock is such a study, and is deleted at the end.
 
     :param name: of the search
     :return: a function that gives a sign of life, to be called more often than once a minute

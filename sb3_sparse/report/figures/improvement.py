@@ -17,7 +17,7 @@ SHORT = {DENSE: "dense 100 %", EQUAL: "equal dense"}
     "Probability of improvement",
     "Probability that a run of the first method scores higher than one of the second on the same "
     "task, mean over tasks, ties counted half, with 95 % stratified bootstrap intervals (rliable). "
-    "The vertical line is no difference.",
+    "The vertical line marks no difference.",
 )
 def draw(results: Results) -> Drawing:
     """Draw sparse methods against both dense networks, and RigL against SET."""

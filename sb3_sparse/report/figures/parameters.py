@@ -39,7 +39,7 @@ def draw(results: Results) -> Drawing:
         )
     ]
     if not places:
-        raise NotEnoughData("there is no trained run but dense ones of full size")
+        raise NotEnoughData("there is no trained run except dense ones of full size")
     sheet = Sheet(HEADS, len(places), height=3.2)
     for one, (family, env_id) in zip(sheet.axes, places, strict=True):
         _panel(one, sheet, results, family, env_id)

@@ -37,8 +37,8 @@ def draw(results: Results) -> Drawing:
     }
     if not places:
         raise NotEnoughData(
-            "no method was trained with two shares of the actor or more (actor_share) that differ "
-            "in nothing else"
+            "no method was trained with two or more shares of the actor (actor_share) and "
+            "otherwise equal settings"
         )
     sheet = Sheet(HEADS, len(places), height=3.0)
     for one, ((family, env_id), lines) in zip(sheet.axes, sorted(places.items()), strict=True):

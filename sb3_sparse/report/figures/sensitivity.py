@@ -38,7 +38,7 @@ def draw(results: Results) -> Drawing:
     }
     if not places:
         raise NotEnoughData(
-            f"no method was trained with two values of {name} or more that differ in nothing else"
+            f"no method was trained with two or more values of {name} and otherwise equal settings"
         )
     sheet = Sheet(HEADS, len(places), height=3.0)
     panels = zip(sheet.axes, sorted(places.items()), strict=True)
