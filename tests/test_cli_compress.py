@@ -22,8 +22,7 @@ from typer.testing import CliRunner
 
 from sb3_sparse.cli import app
 from sb3_sparse.errors import ConfigError
-from sb3_sparse.zoo.finetune import evaluation_envs, training_envs
-from sb3_sparse.zoo.saved import find_saved
+from sb3_sparse.zoo.saved import SavedModel
 
 QUICK = ["--steps", "64", "--eval-episodes", "4"]
 
@@ -74,8 +73,8 @@ def test_a_stock_run_becomes_a_run_that_enjoy_and_inspect_read(run):
 
 
 def test_environments_are_those_of_the_run(run):
-    saved = find_saved(run)
-    training, evaluation = training_envs(saved, None, 0), evaluation_envs(saved, 4, 0)
+    saved = SavedModel.find(run)
+    training, evaluation = saved.training_envs(None, 0), saved.evaluation_envs(4, 0)
     assert (training.num_envs, evaluation.num_envs) == (2, 4)
     assert training.observation_space.shape == evaluation.observation_space.shape == (12,)
     ours, theirs = unwrap_vec_normalize(training), unwrap_vec_normalize(evaluation)
@@ -84,7 +83,7 @@ def test_environments_are_those_of_the_run(run):
     np.testing.assert_array_equal(ours.obs_rms.mean, theirs.obs_rms.mean)
     assert ours.obs_rms.count > 64
     with pytest.raises(ConfigError, match="n_envs must be 1 or more, got 0"):
-        training_envs(saved, 0, 0)
+        saved.training_envs(0, 0)
 
 
 def test_a_lone_zip_needs_its_environment_and_statistics(run, tmp_path):

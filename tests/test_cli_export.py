@@ -13,7 +13,7 @@ from support import make
 from sb3_sparse import cli
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.export.numpy_policy import Policy
-from sb3_sparse.zoo.saved import algos_of, find_saved
+from sb3_sparse.zoo.saved import SavedModel, algos_of
 from sb3_sparse.zoo.spec import RunSpec
 from sb3_sparse.zoo.training import train
 
@@ -48,7 +48,7 @@ def test_a_run_is_exported_with_its_normalisation(run_folder, to, monkeypatch, c
     assert code == 0, said
     assert "1000 recorded and 1000 random observations" in said
     if to == "numpy":
-        saved = find_saved(run_folder)
+        saved = SavedModel.find(run_folder)
         model, policy = saved.load(), Policy(tmp_path / "p.npz")
         normalization = pickle.loads(saved.vecnormalize.read_bytes())
         raw = np.random.default_rng(0).normal(size=(9, 3)).astype(np.float32)
@@ -64,8 +64,8 @@ def test_a_zip_in_a_run_folder_knows_its_run(run_folder, monkeypatch, capsys, tm
         )
         assert code == 0, said
         assert "1000 recorded" in said
-    assert find_saved(run_folder / "best_model.zip").vecnormalize is not None
-    assert find_saved(run_folder / "best_model").path.suffix == ".zip"
+    assert SavedModel.find(run_folder / "best_model.zip").vecnormalize is not None
+    assert SavedModel.find(run_folder / "best_model").path.suffix == ".zip"
 
 
 def test_missing_statistics_are_an_error(run_folder, monkeypatch, capsys, tmp_path):

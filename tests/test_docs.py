@@ -37,9 +37,19 @@ DOORS += [".sparsity", ".studies", ".topology", ".tuning", ".zoo"]
 WITHOUT_EXAMPLE: set[str] = {
     "sb3_sparse.report.LeftOut",
     "sb3_sparse.report.RunData",
+    "sb3_sparse.studies.CellState",
     "sb3_sparse.studies.CellStatus",
     "sb3_sparse.studies.Progress",
     "sb3_sparse.studies.Study",
+    "sb3_sparse.zoo.Archive",
+    "sb3_sparse.zoo.Archived",
+    "sb3_sparse.zoo.Inspection",
+    "sb3_sparse.zoo.Outcome",
+    "sb3_sparse.zoo.Record",
+    "sb3_sparse.zoo.Result",
+    "sb3_sparse.zoo.Score",
+    "sb3_sparse.zoo.Status",
+    "sb3_sparse.zoo.Watch",
 }
 """Public classes whose docstring has no example yet."""
 
@@ -332,7 +342,7 @@ def test_the_export_and_compress_commands_of_the_documents_are_understood(comman
         asked.append((path, options))
         raise Enough
 
-    monkeypatch.setattr("sb3_sparse.zoo.saved.find_saved", note)
+    monkeypatch.setattr("sb3_sparse.zoo.saved.SavedModel.find", note)
     with pytest.raises(Enough):
         cli.app(shlex.split(command, comments=True)[1:], standalone_mode=False)
     ((path, _),) = asked

@@ -58,18 +58,11 @@ def compress_command(
     The same command resumes an interrupted compression.
     """
     from sb3_sparse.compress import compress_model
-    from sb3_sparse.zoo.checkpoint import locked
-    from sb3_sparse.zoo.finetune import (
-        environment_of,
-        evaluated_deterministically,
-        evaluation_envs,
-        training_envs,
-        write_run_files,
-    )
-    from sb3_sparse.zoo.saved import find_saved
+    from sb3_sparse.zoo.folder import RunFolder, env_name
+    from sb3_sparse.zoo.saved import SavedModel
     from sb3_sparse.zoo.speed import use_few_threads
 
-    saved = find_saved(
+    saved = SavedModel.find(
         model,
         best=best,
         algo=algo,
@@ -77,17 +70,17 @@ def compress_command(
         vecnormalize=vecnormalize,
         gym_packages=gym_packages or [],
     )
-    env_id = environment_of(saved)
+    env_id = saved.environment
     folder = out or _default_folder(model, sparsity)
-    training = training_envs(saved, n_envs, seed)
-    evaluation = evaluation_envs(saved, eval_episodes, seed)
+    training = saved.training_envs(n_envs, seed)
+    evaluation = saved.evaluation_envs(eval_episodes, seed)
     try:
         trained = saved.load(training)
         trained.verbose, trained.tensorboard_log = 0, None
         use_few_threads(trained.observation_space)
         say(f"Compressing {saved.path} ({saved.algo.upper()} on {env_id}) into {folder}")
         folder.mkdir(parents=True, exist_ok=True)
-        with locked(folder):
+        with RunFolder(folder).locked():
             outcome = compress_model(
                 trained,
                 evaluation,
@@ -97,12 +90,12 @@ def compress_command(
                 steps=steps,
                 episodes=eval_episodes,
                 seed=seed,
-                deterministic=evaluated_deterministically(saved),
+                deterministic=saved.acts_deterministically,
                 distribution=distribution,
-                name=env_id.replace("/", "-"),
+                name=env_name(env_id),
                 say=say,
             )
-            write_run_files(saved, folder)
+            saved.write_run_files(folder)
     except KeyboardInterrupt:
         say("Interrupted. Finished levels are kept; give the same command to resume.")
         raise typer.Exit(INTERRUPTED) from None

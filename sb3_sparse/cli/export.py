@@ -39,10 +39,9 @@ def export_command(
     """
     check_format(to)
     from sb3_sparse.export import export_policy, record_observations
-    from sb3_sparse.zoo.finetune import evaluation_envs
-    from sb3_sparse.zoo.saved import find_saved
+    from sb3_sparse.zoo.saved import SavedModel
 
-    saved = find_saved(
+    saved = SavedModel.find(
         model,
         best=best,
         algo=algo,
@@ -55,7 +54,7 @@ def export_command(
     loaded = saved.load()
     observations = None
     if saved.env_id is not None:
-        envs = evaluation_envs(saved, RECORDING_ENVS, 0)
+        envs = saved.evaluation_envs(RECORDING_ENVS, 0)
         try:
             observations = record_observations(loaded, envs, RECORDED)
         finally:

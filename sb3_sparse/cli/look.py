@@ -63,8 +63,9 @@ def enjoy_command(
 
 def inspect_command(
     model: Annotated[Path, typer.Argument(help="A run's folder, or a model saved by SB3 (.zip).")],
+    best: Best = False,
 ) -> None:
     """Print the layers of a saved sparse model, and how each of them computes."""
     from sb3_sparse.zoo.inspection import inspect_model
 
-    say(inspect_model(model))
+    say(inspect_model(model, best))

@@ -20,7 +20,6 @@ from sb3_sparse.studies import Study
 if TYPE_CHECKING:
     from sb3_sparse.studies.status import CellStatus
 
-OVER = ("done", "diverged")
 studies = typer.Typer(no_args_is_help=True)
 Name = Annotated[str, typer.Argument(help="A name of `study list`, or a file of your own, .yml.")]
 Scale = Annotated[
@@ -118,23 +117,22 @@ def status(
     """Show the progress of a study, and which of its runs failed."""
     asked = _Asked(name, scale, store, archive, gym_packages or [])
     study = asked.study()
-    from sb3_sparse.studies.status import FAILED, RUNNING, STOPPED, counts
-    from sb3_sparse.zoo.record import DIVERGED
+    from sb3_sparse.studies.status import CellState, counts
 
     statuses = asked.statuses(study)
     _say_merged(study)
     found = counts(statuses)
     say(f"{study.title}, scale {scale}: {len(statuses)} runs")
     say(", ".join(f"{number} {what}" for what, number in found.items()))
-    done = Counter(one.cell.run.env_id for one in statuses if one.status == "done")
+    done = Counter(one.cell.run.env_id for one in statuses if one.state is CellState.DONE)
     for env_id, planned in Counter(one.cell.run.env_id for one in statuses).items():
         say(f"  {env_id}: {done[env_id]} of {planned}")
     for one in statuses:
-        if one.status in (RUNNING, STOPPED):
-            say(f"{one.status}: {one.cell.name}, {one.steps} steps")
-        if one.status == DIVERGED:
+        if one.state in (CellState.RUNNING, CellState.STOPPED):
+            say(f"{one.state}: {one.cell.name}, {one.steps} steps")
+        if one.state is CellState.DIVERGED:
             say(f"diverged: {one.cell.name}, at step {one.steps}")
-        if one.status == FAILED:
+        if one.state is CellState.FAILED:
             why = one.reason or f"see {one.cell.errors(store)}"
             say(f"failed: {one.cell.name}; {why}")
 
@@ -156,8 +154,8 @@ def report(
     from sb3_sparse.report import write_report
 
     statuses = asked.statuses(study)
-    archived = {one.folder: one.archived for one in statuses if one.archived is not None}
-    folders = [one.folder for one in statuses if one.folder.is_dir()]
+    archived = {one.folder.path: one.archived for one in statuses if one.archived is not None}
+    folders = [one.folder.path for one in statuses if one.folder.path.is_dir()]
     if not folders and not archived:
         where = store if archive is None else f"{store} or {archive}"
         raise ConfigError(
@@ -171,7 +169,7 @@ def report(
         varies=study.varies,
         command=asked.command("run"),
         archived=archived,
-        pending=[_pending(one, store) for one in statuses if one.status not in OVER],
+        pending=[_pending(one, store) for one in statuses if not one.state.is_over],
     )
     say(f"Written: {page}")
 
@@ -193,7 +191,7 @@ def _check_figures(study: Study) -> None:
 
 def _pending(one: CellStatus, store: Path) -> str:
     why = one.reason or f"see {one.cell.errors(store)}"
-    failed = f": failed, {why}" if one.status == "failed" else ""
+    failed = f": failed, {why}" if one.state == "failed" else ""
     return f"{one.cell.name}{failed}"
 
 

@@ -32,7 +32,7 @@ from sb3_sparse.cli.common import (
     values_and_packages,
 )
 from sb3_sparse.errors import ConfigError, command
-from sb3_sparse.zoo.settings import method_of, parse_overrides
+from sb3_sparse.zoo.settings import parse_overrides
 from sb3_sparse.zoo.spec import RunSpec
 
 if TYPE_CHECKING:
@@ -145,7 +145,7 @@ def _follow(headline: str, engine: Callable[..., Outcome]) -> None:
 
 def _headline(run: RunSpec) -> str:
     settings = run.settings()
-    kwargs, method = settings["policy_kwargs"], method_of(settings)
+    kwargs, method = settings["policy_kwargs"], settings.method
     if run.match_params is not None:
         how = f"dense with the parameters of {run.match_params:.0%}"
     elif method == "dense":

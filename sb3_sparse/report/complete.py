@@ -2,26 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 from sb3_sparse.errors import ConfigError
-from sb3_sparse.zoo.record import DIVERGED, NAME
+from sb3_sparse.zoo.record import NAME, Record, Status
 
-FINISHED, COUNTED = "finished", "counted"
 NEAR = 0.01  # of the connections; what rounding and schedules differ by is far less
 
 
-def check_complete(record: Mapping[str, Any]) -> None:
+def check_complete(record: Record) -> None:
     """Refuse a run that is not over, or a record that lacks a part.
 
     :raises ConfigError: with the status or the missing part
     """
-    status = record.get("status")
-    if status == "failed":
+    if record.status is Status.FAILED:
         raise ConfigError(f"failed: {record.get('error') or 'no reason is recorded'}")
-    if status not in (FINISHED, COUNTED, DIVERGED):
-        raise ConfigError(f"not finished: its status is {status!r}")
+    if not record.status.is_over:
+        raise ConfigError(f"not finished: its status is {str(record.status)!r}")
     for name in ("run", "settings", "total", "layers", "method"):
         if not record.get(name):
             raise ConfigError(f"{NAME} is incomplete: {name!r} is missing")
@@ -32,14 +27,14 @@ def check_complete(record: Mapping[str, Any]) -> None:
                 raise ConfigError(f"{NAME} is incomplete: {part}.{name} is missing")
 
 
-def check_reached(record: Mapping[str, Any]) -> None:
+def check_reached(record: Record) -> None:
     """Refuse a run whose networks are not as sparse as its settings say.
 
     Runs of before ``wanted_nnz`` was recorded can only have stayed too dense after a denser start.
 
     :raises ConfigError: with what it reached and what it was to reach
     """
-    total, kwargs = record["total"], record["settings"].get("policy_kwargs", {})
+    total, kwargs = record["total"], record.settings["policy_kwargs"]
     reached, asked = float(total["sparsity"]), kwargs.get("sparsity")
     wanted = total.get("wanted_nnz")
     if wanted is not None:

@@ -16,16 +16,19 @@ import numpy.typing as npt
 
 from sb3_sparse.errors import ConfigError, CorruptStateError, SparsityError
 from sb3_sparse.loading.arrays import read_arrays
-from sb3_sparse.loading.guard import reading
-from sb3_sparse.report.complete import FINISHED, check_complete, check_reached
+from sb3_sparse.report.complete import check_complete, check_reached
 from sb3_sparse.report.measured import Rows, measured_text, rows_of
 from sb3_sparse.report.methods import DENSE, EQUAL
-from sb3_sparse.report.settings import WIDTHS, callback_of, family_of, overrides_of, variant_of
 from sb3_sparse.zoo.archive import Archived
-from sb3_sparse.zoo.record import CURE, DIVERGED, NAME, WHAT, read_record
+from sb3_sparse.zoo.environments import suite_of
+from sb3_sparse.zoo.folder import EVALUATIONS, RunFolder
+from sb3_sparse.zoo.record import NAME, Record, Status
 from sb3_sparse.zoo.results import score_of
+from sb3_sparse.zoo.settings import Settings
 
 Array = npt.NDArray[np.float64]
+WIDTHS = ("net_arch", "features_extractor_class", "features_extractor_kwargs")
+"""What follows from the sparsity in a dense network that matches a sparse one's parameters."""
 MEASURED = {
     "snr.csv": ("timesteps", "name", "value"),
     "plasticity.csv": ("timesteps", "name", "value"),
@@ -63,7 +66,7 @@ class RunData:
     """
 
     folder: Path
-    record: Mapping[str, Any]
+    record: Record
     timesteps: Array
     returns: Array
     measured: Mapping[str, Rows] = field(default_factory=dict)
@@ -71,7 +74,7 @@ class RunData:
     @property
     def trained(self) -> bool:
         """Whether it was trained, not only counted."""
-        return bool(self.record["status"] == FINISHED)
+        return self.record.status is Status.FINISHED
 
     @property
     def algo(self) -> str:
@@ -86,9 +89,8 @@ class RunData:
         return int(self.record["run"]["seed"])
 
     @property
-    def settings(self) -> Mapping[str, Any]:
-        found: Mapping[str, Any] = self.record["settings"]
-        return found
+    def settings(self) -> Settings:
+        return self.record.settings
 
     @property
     def steps(self) -> int:
@@ -98,7 +100,9 @@ class RunData:
     @cached_property
     def family(self) -> str:
         """Algorithm, architecture and suite: what is compared with one another."""
-        return family_of(self.algo, self.env_id, self.settings)
+        extractor = str(self.settings["policy_kwargs"].get("features_extractor_class", ""))
+        resnet = " with the Impala ResNet" if "impala" in extractor.lower() else ""
+        return f"{self.algo.upper()}{resnet} on {suite_of(self.env_id)}"
 
     @cached_property
     def label(self) -> str:
@@ -115,7 +119,7 @@ class RunData:
             return float(matched)
         if self.label == DENSE:
             return 0.0
-        asked = self.settings.get("policy_kwargs", {}).get("sparsity")
+        asked = self.settings["policy_kwargs"].get("sparsity")
         if isinstance(asked, (int, float)):
             return float(asked)
         return round(float(self.record["total"]["sparsity"]), 3)
@@ -163,12 +167,14 @@ class RunData:
 
         :param without: names of more settings that may differ
         """
-        return variant_of(self.settings, (*without, *(WIDTHS if self.label == EQUAL else ())))
+        return self.settings.variant((*without, *(WIDTHS if self.label == EQUAL else ())))
 
     @property
-    def callback(self) -> Mapping[str, Any]:
-        """Arguments of the mask's schedule."""
-        return callback_of(self.settings)
+    def changes(self) -> int:
+        """How many settings the run changes in its config."""
+        run = self.record["run"]
+        others = sum(run.get(name) is not None for name in ("distribution", "conf_file", "entry"))
+        return len(run.get("hyperparams") or {}) + others
 
 
 def read_runs(
@@ -204,21 +210,21 @@ def read_runs(
 def _read(folder: Path, archived: Archived | None) -> tuple[RunData, list[str]]:
     if archived is None and not folder.is_dir():
         raise ConfigError("missing: there is no such folder")
-    record = read_record(folder) if archived is None else archived.record
+    record = RunFolder(folder).record() if archived is None else archived.record
     empty = np.zeros(0)
     diverged = ""
-    with reading(folder / NAME, WHAT, CURE):
+    with record.reading():
         check_complete(record)
-        if record["status"] == DIVERGED:
+        if record.status is Status.DIVERGED:
             diverged = _divergence(RunData(folder, record, empty, empty))
         else:
             check_reached(record)
     if diverged:
         raise _DivergedRun(diverged)
     timesteps, returns = empty, empty
-    if record["status"] == FINISHED:
+    if record.status is Status.FINISHED:
         timesteps, returns = (
-            _evaluations(folder / "evaluations.npz")
+            _evaluations(folder / EVALUATIONS)
             if archived is None
             else (archived.timesteps, archived.returns.mean(axis=1))
         )
@@ -231,7 +237,7 @@ def _read(folder: Path, archived: Archived | None) -> tuple[RunData, list[str]]:
         except SparsityError as error:
             remarks.append(f"only its {name}: {error}; all else of the run is in")
     run = RunData(folder, record, timesteps, returns, measured)
-    with reading(folder / NAME, WHAT, CURE):
+    with record.reading():
         _try_out(run)
     return run, remarks
 
@@ -262,7 +268,7 @@ def _try_out(run: RunData) -> None:
             raise CorruptStateError(
                 f"{run.folder / NAME} is damaged: {layer['name']} has shape {layer['shape']!r}"
             )
-    _identity(run), run.variant(), overrides_of(run.record["run"]), names
+    _identity(run), run.variant(), run.changes, names
 
 
 def _evaluations(path: Path) -> tuple[Array, Array]:
@@ -286,5 +292,5 @@ def _evaluations(path: Path) -> tuple[Array, Array]:
 def _identity(run: RunData) -> str:
     keys = ("algo", "env_id", "seed", "match_params")
     asked = {name: run.record["run"].get(name) for name in keys}
-    content = [asked, run.record["method"], run.trained, run.settings]
+    content = [asked, run.record["method"], run.trained, dict(run.settings)]
     return json.dumps(content, sort_keys=True, default=str)

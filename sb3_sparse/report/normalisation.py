@@ -8,7 +8,7 @@ from statistics import fmean
 
 from sb3_sparse.report.data import RunData
 from sb3_sparse.report.methods import DENSE
-from sb3_sparse.report.settings import ATARI, game_of, suite_of
+from sb3_sparse.zoo.environments import ATARI, game_of, suite_of
 
 # (random play, professional human tester). Source: Mnih et al. 2015 (Nature 518:529), extended data
 # table 2. The table of DQN Zoo and rliable differs: its human scores are of a later tester.

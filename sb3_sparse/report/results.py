@@ -11,7 +11,7 @@ from sb3_sparse.errors import SparsityError
 from sb3_sparse.report.data import RunData
 from sb3_sparse.report.methods import DENSE, in_order
 from sb3_sparse.report.normalisation import Normaliser
-from sb3_sparse.report.settings import overrides_of, setting_of
+from sb3_sparse.zoo.spec import algorithms
 
 Cell = tuple[str, str, str, float]
 
@@ -97,7 +97,7 @@ class Results:
 
     def setting(self, run: RunData, name: str) -> object:
         """Return a setting's value in a run, or its default."""
-        return setting_of(run.algo, run.settings, name)
+        return run.settings.value(name, algorithms().get(run.algo))
 
 
 def cell_of(run: RunData) -> Cell:
@@ -143,4 +143,4 @@ def choose(runs: Sequence[RunData]) -> tuple[list[RunData], list[str]]:
 
 
 def _changed(runs: Sequence[RunData]) -> int:
-    return min(overrides_of(run.record["run"]) for run in runs)
+    return min(run.changes for run in runs)

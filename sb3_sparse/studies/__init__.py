@@ -10,12 +10,13 @@ if TYPE_CHECKING:
     from sb3_sparse.studies.blocks import study_names
     from sb3_sparse.studies.runner import Progress, run_study
     from sb3_sparse.studies.spec import Study
-    from sb3_sparse.studies.status import CellStatus, status_of
+    from sb3_sparse.studies.status import CellState, CellStatus, status_of
 
-__all__ = ["CellStatus", "Progress", "Study", "run_study", "status_of", "study_names"]
+__all__ = ["CellState", "CellStatus", "Progress", "Study", "run_study", "status_of", "study_names"]
 __getattr__, __dir__ = lazily(
     __name__,
     {
+        "CellState": "status",
         "CellStatus": "status",
         "Progress": "runner",
         "Study": "spec",

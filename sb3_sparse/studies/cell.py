@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from sb3_sparse.studies.measures import Measures
+from sb3_sparse.zoo.folder import RunFolder, env_name
 from sb3_sparse.zoo.spec import RunSpec
 
 RUNS = "runs"
@@ -42,7 +43,7 @@ class Cell:
             "algo": run.algo,
             "env_id": run.env_id,
             "seed": run.seed,
-            "settings": run.settings(),
+            "settings": run.settings().as_dict(),
             "evaluation": run.evaluation(),
             "match_params": run.match_params,
             "during": self.measures.during,
@@ -53,10 +54,10 @@ class Cell:
         text = json.dumps(content, sort_keys=True, default=_plain)
         return hashlib.sha256(text.encode()).hexdigest()[:DIGITS]
 
-    def folder(self, store: Path) -> Path:
+    def folder(self, store: Path) -> RunFolder:
         """The run's folder, ``<store>/runs/<algo>/<env>_<address>``."""
-        env_name = self.run.env_id.replace("/", "-")
-        return store / RUNS / self.run.algo / f"{env_name}_{self.address}"
+        name = f"{env_name(self.run.env_id)}_{self.address}"
+        return RunFolder(store / RUNS / self.run.algo / name)
 
     def errors(self, store: Path) -> Path:
         """The file with the tracebacks of a cell that failed; it is there only if it did."""

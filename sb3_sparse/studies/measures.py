@@ -9,6 +9,7 @@ from typing import Any
 
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.sparsity.numeric import is_number, is_whole
+from sb3_sparse.zoo.record import Record
 
 DURING = {"snr": ("every", "batch_size"), "plasticity": ("every",)}
 AFTER = {"noise": ("sigmas", "n_episodes", "seeds")}
@@ -73,12 +74,12 @@ class Measures:
             for name, arguments in self.during.items()
         ]
 
-    def missing(self, record: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
+    def missing(self, record: Record) -> dict[str, Mapping[str, Any]]:
         """What is still to be measured of a trained model.
 
-        :param record: the content of its ``sparsity.json``
+        :param record: of its run
         """
-        measured = record.get("measured", {})
+        measured = record.measured
         return {name: given for name, given in self.after.items() if measured.get(name) != given}
 
 

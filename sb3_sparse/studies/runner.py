@@ -12,9 +12,8 @@ from sb3_sparse.launch.base import Launcher, Task, TaskResult
 from sb3_sparse.studies.cell import Cell
 from sb3_sparse.studies.measures import FILES
 from sb3_sparse.studies.spec import Study
-from sb3_sparse.studies.status import DONE, RUNNING, status_of
+from sb3_sparse.studies.status import CellState, status_of
 from sb3_sparse.zoo.archive import Archive, Archived
-from sb3_sparse.zoo.record import DIVERGED
 
 FUNCTION = "sb3_sparse.studies.worker:work_on"
 
@@ -77,11 +76,11 @@ def run_study(
     """
     kept = _Kept(store, archive)
     statuses = [status_of(cell, store, kept.lines) for cell in study.cells]
-    over = [one for one in statuses if one.status in (DONE, DIVERGED)]
+    over = [one for one in statuses if one.state.is_over]
     kept.add(one.cell for one in over if one.archived is None)
-    diverged = sum(one.status == DIVERGED for one in over)
+    diverged = sum(one.state is CellState.DIVERGED for one in over)
     progress = Progress(len(study.cells), done=len(over) - diverged, diverged=diverged)
-    cells = [one.cell for one in statuses if one.status not in (DONE, DIVERGED)]
+    cells = [one.cell for one in statuses if not one.state.is_over]
     yield progress
     again: set[str] = set()
     for attempt in (1, 2):
@@ -99,7 +98,7 @@ def run_study(
                     again.add(cell.address)
                     progress.retried.append(cell.name)
                 _account(progress, cell, store, ended, last=attempt == 2)
-                if ended.value in (DONE, DIVERGED):
+                if ended.error is None and ended.value.is_over:
                     kept.add([cell])
             progress.running = min(workers, left)
             yield progress
@@ -145,10 +144,12 @@ def _account(progress: Progress, cell: Cell, store: Path, ended: TaskResult, las
         if last:
             progress.failed[cell.name] = ended.error
         return
-    progress.ended = cell.name if ended.value != DIVERGED else f"{cell.name}, diverged"
-    if ended.value in (DONE, DIVERGED):
-        progress.done += ended.value == DONE
-        progress.diverged += ended.value == DIVERGED
+    state = CellState(ended.value)
+    diverged = state is CellState.DIVERGED
+    progress.ended = f"{cell.name}, diverged" if diverged else cell.name
+    if state.is_over:
+        progress.done += not diverged
+        progress.diverged += diverged
         progress.finished_here += 1
-    elif ended.value == RUNNING:
+    elif state is CellState.RUNNING:
         progress.elsewhere += 1

@@ -31,7 +31,7 @@ from sb3_sparse.studies.measures import Measures
 from sb3_sparse.topology import method_named, method_names
 from sb3_sparse.zoo.configs import read_yaml
 from sb3_sparse.zoo.environments import package_names
-from sb3_sparse.zoo.settings import Names, find_callback
+from sb3_sparse.zoo.settings import Names
 from sb3_sparse.zoo.spec import RunSpec
 
 
@@ -143,8 +143,7 @@ def _check_varies(varies: Any, cells: Sequence[Cell], path: Path) -> None:
         return
     known: set[str] = set()
     for algorithm in {cell.run.algorithm for cell in cells}:
-        names = Names.of(algorithm)
-        known |= names.algorithm | names.policy | names.schedule
+        known |= Names.of(algorithm).all
     if not isinstance(varies, str) or varies not in known:
         raise ConfigError(
             f"{path}: varies must be the name of a setting, e.g. batch_size, got {varies!r}"
@@ -188,7 +187,7 @@ def _check_choices(blocks: Sequence[Mapping[str, Any]], scale: Mapping[str, Any]
 def _with_schedule(arguments: dict[str, Any], schedule: Mapping[str, Any]) -> dict[str, Any]:
     """With what of a scale's ``schedule`` the method takes: nothing where masks stand still."""
     run = RunSpec(**arguments)
-    callback = find_callback(run.settings()) if schedule else None
+    callback = run.settings().callback if schedule else None
     if callback is None:
         return arguments
     options = method_named(callback["method"]).options

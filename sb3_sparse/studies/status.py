@@ -4,21 +4,38 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import Enum
 from pathlib import Path
-from typing import Any
 
 from sb3_sparse.errors import SparsityError
-from sb3_sparse.loading.guard import reading
 from sb3_sparse.studies.cell import Cell
 from sb3_sparse.zoo.archive import Archived, Lines
-from sb3_sparse.zoo.checkpoint import is_locked
-from sb3_sparse.zoo.record import CURE, DIVERGED, NAME, WHAT, read_record
+from sb3_sparse.zoo.folder import RunFolder
+from sb3_sparse.zoo.record import Record, Status
 
-DONE, RUNNING, STOPPED, FAILED, WAITING = "done", "running", "stopped", "failed", "waiting"
-STATUSES = (DONE, DIVERGED, RUNNING, STOPPED, FAILED, WAITING)
-OVER = {True: "finished", False: "counted"}
+
+class CellState(str, Enum):
+    """How far a cell is. A finished run is not done until all is measured that is wanted."""
+
+    DONE = "done"
+    DIVERGED = "diverged"
+    """Its training diverged, and is not tried again."""
+    RUNNING = "running"
+    """Some process trains it now."""
+    STOPPED = "stopped"
+    """It resumes from its last checkpoint."""
+    FAILED = "failed"
+    WAITING = "waiting"
+    """Nothing was done yet."""
+
+    __str__ = str.__str__
+
+    @property
+    def is_over(self) -> bool:
+        """Whether nothing of the cell is left to do."""
+        return self in (CellState.DONE, CellState.DIVERGED)
 
 
 @dataclass(frozen=True)
@@ -27,57 +44,65 @@ class CellStatus:
 
     :param cell: which
     :param folder: its run's folder, there or not
-    :param status: ``"done"``, ``"running"`` (some process trains it now), ``"stopped"`` (it goes on
-        from its last checkpoint), ``"diverged"`` (it is over), ``"failed"`` or ``"waiting"``
+    :param state: how far it is
     :param steps: environment steps done
     :param reason: what is wrong with its record; None: nothing, or it failed in training
     :param archived: its line in the archive, if that has all that is wanted of it
     """
 
     cell: Cell
-    folder: Path
-    status: str
+    folder: RunFolder
+    state: CellState
     steps: int = 0
     reason: str | None = None
     archived: Archived | None = None
 
 
 def status_of(cell: Cell, store: Path, lines: Lines | None = None) -> CellStatus:
-    """How far a cell is. A line in the archive goes before what lies in its folder.
+    """How far a cell is. A line in the archive counts before what lies in its folder.
+
+    Example::
+
+        from pathlib import Path
+        from sb3_sparse.studies import Study, status_of
+
+        study = Study.read("classic_control", "smoke")
+        print({status_of(cell, Path("studies")).state for cell in study.cells})
 
     :param store: folder of the studies' runs
     :param lines: of the archive
     """
     folder = cell.folder(store)
     for line in reversed((lines or {}).get(cell.address, ())):
-        status, steps = _over(cell, line.record), int(line.record.get("num_timesteps", 0))
-        if status is not None:
-            return CellStatus(cell, folder, status, steps, archived=line)
-    failed, running = cell.errors(store).is_file(), is_locked(folder)
-    if not (folder / NAME).is_file():
-        return CellStatus(cell, folder, RUNNING if running else FAILED if failed else WAITING)
+        state = _over(cell, line.record)
+        if state is not None:
+            return CellStatus(cell, folder, state, line.record.num_timesteps, archived=line)
+    running = folder.is_locked()
+    unfinished = CellState.FAILED if cell.errors(store).is_file() else None
+    if not folder.has_record:
+        state = CellState.RUNNING if running else unfinished or CellState.WAITING
+        return CellStatus(cell, folder, state)
     try:
-        record = read_record(folder)
-        with reading(folder / NAME, WHAT, CURE):
-            steps = int(record.get("num_timesteps", 0))
-            status = _over(cell, record)
+        record = folder.record()
+        steps, state = record.num_timesteps, _over(cell, record)
     except SparsityError as error:  # one damaged record hides no other cell
         told = str(error).replace(f"{store}{os.sep}", "")  # pages name no path of a machine
-        return CellStatus(cell, folder, FAILED, reason=told)
+        return CellStatus(cell, folder, CellState.FAILED, reason=told)
     if running:
-        return CellStatus(cell, folder, RUNNING, steps)
-    return CellStatus(cell, folder, status or (FAILED if failed else STOPPED), steps)
+        return CellStatus(cell, folder, CellState.RUNNING, steps)
+    return CellStatus(cell, folder, state or unfinished or CellState.STOPPED, steps)
 
 
-def _over(cell: Cell, record: Mapping[str, Any]) -> str | None:
+def _over(cell: Cell, record: Record) -> CellState | None:
     """Whether a run is done with all that is wanted of it, or diverged; None: neither."""
-    if record["status"] == DIVERGED:
-        return DIVERGED
-    done = record["status"] == OVER[cell.trained] and not cell.measures.missing(record)
-    return DONE if done else None
+    if record.status is Status.DIVERGED:
+        return CellState.DIVERGED
+    wanted = Status.FINISHED if cell.trained else Status.COUNTED
+    done = record.status is wanted and not cell.measures.missing(record)
+    return CellState.DONE if done else None
 
 
-def counts(statuses: Sequence[CellStatus]) -> dict[str, int]:
-    """How many cells there are of each status."""
-    found = Counter(one.status for one in statuses)
-    return {status: found[status] for status in STATUSES}
+def counts(statuses: Sequence[CellStatus]) -> dict[CellState, int]:
+    """How many cells there are of each state."""
+    found = Counter(one.state for one in statuses)
+    return {state: found[state] for state in CellState}

@@ -11,7 +11,7 @@ from sb3_sparse.tuning.search import Search
 from sb3_sparse.tuning.yamlfile import as_yaml, merge_entry
 from sb3_sparse.zoo.configs import entry_of
 from sb3_sparse.zoo.environments import is_atari
-from sb3_sparse.zoo.settings import method_of
+from sb3_sparse.zoo.settings import Settings
 from sb3_sparse.zoo.spec import RunSpec
 
 BEST = "best.yml"
@@ -36,8 +36,8 @@ def check_target(run: RunSpec, path: Path) -> None:
     :raises ConfigError: if there is no such file, if it is for another method, or if its entry is
         written in a way that cannot be changed
     """
-    there = method_of(entry_of(path, run.env_id, is_atari(run.env_id)))
-    tuned = method_of(run.settings())
+    there = Settings(entry_of(path, run.env_id, is_atari(run.env_id))).method
+    tuned = run.settings().method
     if there != tuned:
         raise ConfigError(
             f"{path} trains {run.env_id} by method {there!r}, but {tuned!r} is tuned; name the "

@@ -12,7 +12,6 @@ from sb3_sparse.tuning.backend import optuna
 from sb3_sparse.tuning.objective import check_seeds, planned_evaluations
 from sb3_sparse.tuning.samplers import pruner_of, sampler_of
 from sb3_sparse.tuning.spaces import Space, check_space, one_of_each, with_values
-from sb3_sparse.zoo.settings import method_of, policy_kwargs_of
 from sb3_sparse.zoo.spec import RunSpec
 
 DEFAULT_TRIALS = 100
@@ -46,12 +45,12 @@ class Definition:
     @property
     def method(self) -> str:
         """The method that is tuned."""
-        return method_of(self.run.settings())
+        return self.run.settings().method
 
     @property
     def default_name(self) -> str:
         """The search's name if the user gives none."""
-        sparsity = policy_kwargs_of(self.run.settings())["sparsity"]
+        sparsity = self.run.settings()["policy_kwargs"]["sparsity"]
         shares = sparsity.values() if isinstance(sparsity, Mapping) else [sparsity]
         parts = [self.run.algo, self.run.env_id.replace("/", "-"), self.method]
         searched = "sparsity" in one_of_each(self.space)
@@ -101,7 +100,7 @@ class Definition:
             "seeds": self.seeds,
             "sampler": self.sampler,
             "pruner": self.pruner,
-            "settings": with_values(self.run, one_of_each(self.space)).settings(),
+            "settings": with_values(self.run, one_of_each(self.space)).settings().as_dict(),
             "evaluation": self.run.evaluation(),
         }
 

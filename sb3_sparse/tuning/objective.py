@@ -15,9 +15,9 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_sparse.errors import ConfigError, Diverged
 from sb3_sparse.tuning.backend import Trial, optuna
 from sb3_sparse.tuning.spaces import Space, with_values
-from sb3_sparse.zoo.checkpoint import clear_checkpoints
 from sb3_sparse.zoo.evaluation import Evaluation
-from sb3_sparse.zoo.record import write_record
+from sb3_sparse.zoo.folder import RunFolder
+from sb3_sparse.zoo.record import Status
 from sb3_sparse.zoo.results import score_of
 from sb3_sparse.zoo.spec import RunSpec
 from sb3_sparse.zoo.training import train
@@ -86,8 +86,9 @@ class Objective:
                     replace(run, seed=run.seed + seed), folder, after_evaluation=evaluations
                 )
             except optuna.TrialPruned:
-                clear_checkpoints(evaluations.parent.folder)
-                write_record(evaluations.parent.folder, status="pruned", error=None)
+                pruned = RunFolder(evaluations.parent.folder)
+                pruned.clear_checkpoints()
+                pruned.write(status=Status.PRUNED, error=None)
                 raise
             except Diverged as error:  # a result: these values train nothing
                 trial.set_user_attr("diverged", str(error))

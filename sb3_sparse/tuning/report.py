@@ -18,7 +18,6 @@ from sb3_sparse.tuning.search import DEFINITION, Search, folder_name
 from sb3_sparse.tuning.spaces import with_values
 from sb3_sparse.tuning.storage import FOLDER, JOURNAL, open_existing
 from sb3_sparse.tuning.urls import shown_url
-from sb3_sparse.zoo.settings import policy_kwargs_of
 
 try:
     import plotly.io
@@ -124,7 +123,7 @@ def _what(definition: Definition, best: FrozenTrial | None) -> str:
     if definition.method == "dense":
         return "dense"
     run = definition.run if best is None else with_values(definition.run, best.user_attrs[VALUES])
-    sparsity = policy_kwargs_of(run.settings())["sparsity"]
+    sparsity = run.settings()["policy_kwargs"]["sparsity"]
     share = f"{100 * sparsity:.4g}%" if isinstance(sparsity, float) else str(sparsity)
     return f"{definition.method} at {share}"
 

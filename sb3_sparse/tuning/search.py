@@ -149,7 +149,7 @@ class Search:
 
         :raises ConfigError: if no trial was completed
         """
-        return with_values(self.definition.run, self.best().user_attrs[VALUES]).settings()
+        return with_values(self.definition.run, self.best().user_attrs[VALUES]).settings().as_dict()
 
     def describe_best(self) -> str:
         """Return where the best values come from: search, number of trials, score and date."""

@@ -13,7 +13,7 @@ from sb3_sparse.tuning.spaces import (
     IntDistribution,
     Space,
 )
-from sb3_sparse.zoo.spec import DENSE
+from sb3_sparse.zoo.settings import DENSE
 
 WEIGHT_DECAY = (0.0, 1e-6, 1e-4, 1e-3)
 UPDATE_INTERVAL = (100, 250, 500, 1000, 5000)

@@ -22,7 +22,6 @@ from sb3_sparse.tuning.spaces import (
 from sb3_sparse.zoo.configs import read_yaml
 from sb3_sparse.zoo.match import untrained_policy
 from sb3_sparse.zoo.prepare import prepare
-from sb3_sparse.zoo.settings import method_of
 from sb3_sparse.zoo.spec import RunSpec
 
 
@@ -53,7 +52,7 @@ def space_of(what: str, run: RunSpec) -> Space:
 
 
 def _paper(run: RunSpec) -> Space:
-    return paper_space(method_of(run.settings()))
+    return paper_space(run.settings().method)
 
 
 def _wide(run: RunSpec) -> Space:
@@ -64,7 +63,7 @@ def _wide(run: RunSpec) -> Space:
     sizes = {network.name: network.size for network in policy.sparse.networks}
     sparsity = policy.sparsity_config.sparsity
     shared = sparsity if isinstance(sparsity, float) else None
-    return wide_space(method_of(run.settings()), sizes, shared)
+    return wide_space(run.settings().method, sizes, shared)
 
 
 SHIPPED: dict[str, Callable[[RunSpec], Space]] = {"paper": _paper, "wide": _wide}

@@ -11,8 +11,8 @@ from typing import Any
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.topology import method_named
 from sb3_sparse.tuning.backend import BaseDistribution, Trial, optuna, quiet_optuna
-from sb3_sparse.zoo.settings import method_of
-from sb3_sparse.zoo.spec import DENSE, RunSpec
+from sb3_sparse.zoo.settings import DENSE
+from sb3_sparse.zoo.spec import RunSpec
 
 CategoricalDistribution = optuna.distributions.CategoricalDistribution
 FloatDistribution = optuna.distributions.FloatDistribution
@@ -227,7 +227,7 @@ def _check_names(space: Space, run: RunSpec, names: Set[str]) -> None:
                 f"the search space {space.name!r} varies {name}, which is also fixed to "
                 f"{fixed[name]!r}; drop one of the two"
             )
-    method = method_of(run.settings())
+    method = run.settings().method
     if method == DENSE:
         absent = (OF_SPARSE_POLICIES | OF_METHODS) & names
     else:

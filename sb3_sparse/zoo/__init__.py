@@ -1,5 +1,65 @@
-"""Training runs in the manner of the RL zoo: configs, runs, and what they leave behind."""
+"""Training runs in the manner of the RL zoo: what to train, training it, and what it leaves."""
 
-from sb3_sparse.zoo.configs import config_path
+from __future__ import annotations
 
-__all__ = ["config_path"]
+from typing import TYPE_CHECKING
+
+from sb3_sparse.lazy import lazily
+
+if TYPE_CHECKING:
+    from sb3_sparse.zoo.archive import Archive, Archived
+    from sb3_sparse.zoo.configs import config_path
+    from sb3_sparse.zoo.folder import RunFolder
+    from sb3_sparse.zoo.inspection import Inspection, inspect_model
+    from sb3_sparse.zoo.record import Record, Status
+    from sb3_sparse.zoo.results import Outcome, Result
+    from sb3_sparse.zoo.saved import SavedModel
+    from sb3_sparse.zoo.scoring import Score, enjoy
+    from sb3_sparse.zoo.settings import Settings
+    from sb3_sparse.zoo.spec import RunSpec
+    from sb3_sparse.zoo.training import resume, train
+    from sb3_sparse.zoo.watch import Watch
+
+__all__ = [
+    "Archive",
+    "Archived",
+    "Inspection",
+    "Outcome",
+    "Record",
+    "Result",
+    "RunFolder",
+    "RunSpec",
+    "SavedModel",
+    "Score",
+    "Settings",
+    "Status",
+    "Watch",
+    "config_path",
+    "enjoy",
+    "inspect_model",
+    "resume",
+    "train",
+]
+__getattr__, __dir__ = lazily(
+    __name__,
+    {
+        "Archive": "archive",
+        "Archived": "archive",
+        "Inspection": "inspection",
+        "Outcome": "results",
+        "Record": "record",
+        "Result": "results",
+        "RunFolder": "folder",
+        "RunSpec": "spec",
+        "SavedModel": "saved",
+        "Score": "scoring",
+        "Settings": "settings",
+        "Status": "record",
+        "Watch": "watch",
+        "config_path": "configs",
+        "enjoy": "scoring",
+        "inspect_model": "inspection",
+        "resume": "training",
+        "train": "training",
+    },
+)

@@ -19,15 +19,15 @@ from sb3_sparse.loading.arrays import read_arrays
 from sb3_sparse.loading.guard import reading
 from sb3_sparse.loading.text import read_text
 from sb3_sparse.zoo.disk import writing
-from sb3_sparse.zoo.evaluation import NPZ
-from sb3_sparse.zoo.record import DIVERGED, read_record
+from sb3_sparse.zoo.folder import RunFolder
+from sb3_sparse.zoo.record import CURE as CURE_OF_RUN
+from sb3_sparse.zoo.record import Record, Status
 
 Array = npt.NDArray[np.float64]
 Lines = Mapping[str, "Sequence[Archived]"]
 """The lines of an archive by address, each address's in the order of the file."""
 WHAT = "line of an archive"
 CURE = "restore it from a copy, or remove the line: its run counts as not done then"
-STATUSES = ("finished", "counted", DIVERGED)
 DECIMALS = 6  # of returns, as SB3's Monitor rounds them
 BEGINNING = b'{"address"'
 
@@ -45,43 +45,44 @@ class Archived:
     """
 
     address: str
-    record: Mapping[str, Any]
+    record: Record
     timesteps: Array = field(default_factory=lambda: np.zeros(0))
     returns: Array = field(default_factory=lambda: np.zeros((0, 0)))
     lengths: Array = field(default_factory=lambda: np.zeros((0, 0)))
     measured: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
-    def of_folder(cls, folder: Path, address: str, files: Iterable[str]) -> Archived:
+    def of_folder(cls, folder: RunFolder, address: str, files: Iterable[str]) -> Archived:
         """Read a run's folder.
 
         :param files: names of the files of measurements that it may have
         :raises ConfigError: if there is no run, or it is not over
         :raises CorruptStateError: if something is damaged
         """
-        cure = "restore it from a copy, or remove the run's folder and train anew"
-        record = read_record(folder)
-        if record["status"] not in STATUSES:
-            raise ConfigError(f"the run in {folder} is not over: its status is {record['status']}")
+        record, path = folder.record(), folder.evaluations
+        if not record.status.is_over:
+            raise ConfigError(f"the run in {folder} is not over: its status is {record.status}")
         found: dict[str, Any] = {}
-        if record["status"] == "finished" or (folder / NPZ).is_file():
+        if record.status is Status.FINISHED or path.is_file():
             needed = ("timesteps", "results", "ep_lengths")
-            saved = read_arrays(folder / NPZ, "file of evaluations", cure, needed)
+            saved = read_arrays(path, "file of evaluations", CURE_OF_RUN, needed)
             names = ("timesteps", "returns", "lengths")
-            with reading(folder / NPZ, "file of evaluations", cure):
+            with reading(path, "file of evaluations", CURE_OF_RUN):
                 found = _evaluations(
                     {name: saved[key] for name, key in zip(names, needed, strict=True)}
                 )
         texts = {
-            name: read_text(folder / name, "file of measurements", cure).replace("\r\n", "\n")
+            name: read_text(path, "file of measurements", CURE_OF_RUN).replace("\r\n", "\n")
             for name in files
-            if (folder / name).is_file()
+            if (path := folder.path / name).is_file()
         }
         return cls(address, record, **found, measured=texts)
 
     @classmethod
-    def of_line(cls, line: bytes) -> Archived:
+    def of_line(cls, line: bytes, source: Path) -> Archived:
         """Read what :meth:`line` wrote.
+
+        :param source: file and line, for messages
 
         :raises Exception: of any kind, if it is damaged; call it within
             :func:`~sb3_sparse.loading.guard.reading`
@@ -92,13 +93,15 @@ class Archived:
         address, record, measured = (content[key] for key in ("address", "record", "measured"))
         if not isinstance(address, str) or not address:
             raise ValueError(f"its address is {address!r}")
-        if record["status"] not in STATUSES:
-            raise ValueError(f"its status is {record['status']!r}, not {' or '.join(STATUSES)}")
-        int(record.get("num_timesteps", 0)), dict(record.get("measured", {}))
+        record = Record(record, source, CURE)
+        if not record.status.is_over:
+            raise ValueError(f"its status is {str(record.status)!r}, and its run is not over")
+        for name in ("num_timesteps", "measured"):
+            getattr(record, name)
         if not all(isinstance(text, str) for text in measured.values()):
             raise ValueError("measured must map names of files to their texts")
         if content["evaluations"] is None:
-            if record["status"] == "finished":
+            if record.status is Status.FINISHED:
                 raise ValueError("a finished run needs evaluations")
             return cls(address, record, measured=measured)
         return cls(address, record, **_evaluations(content["evaluations"]), measured=measured)
@@ -108,7 +111,7 @@ class Archived:
         parts = {"timesteps": self.timesteps, "returns": self.returns, "lengths": self.lengths}
         content = {
             "address": self.address,
-            "record": self.record,
+            "record": dict(self.record),
             "evaluations": {name: _short(part.tolist()) for name, part in parts.items()}
             if len(self.timesteps)
             else None,
@@ -118,7 +121,7 @@ class Archived:
 
     def covers(self, other: Archived) -> bool:
         """Whether this is the same run, with all that was measured of the other."""
-        here, there = (dict(one.record.get("measured", {})) for one in (self, other))
+        here, there = self.record.measured, other.record.measured
         return self.address == other.address and {**here, **there} == here
 
 
@@ -183,8 +186,9 @@ class Archive:
         found: dict[str, list[Archived]] = {}
         for number, line in enumerate(lines, start=1):
             if line.strip():
-                with reading(Path(f"{self.path}, line {number}"), WHAT, CURE):
-                    one = Archived.of_line(line)
+                source = Path(f"{self.path}, line {number}")
+                with reading(source, WHAT, CURE):
+                    one = Archived.of_line(line, source)
                 found.setdefault(one.address, []).append(one)
         return found, rest
 

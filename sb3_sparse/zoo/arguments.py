@@ -9,10 +9,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from numbers import Integral, Real
+from numbers import Real
 from typing import Any
 
 from sb3_sparse.policies.registry import lineage
+from sb3_sparse.sparsity.numeric import is_whole
 
 
 @dataclass(frozen=True)
@@ -30,13 +31,8 @@ class Kind:
         return Kind(f"{self.allowed}, or {other.allowed}", lambda v: self.fits(v) or other.fits(v))
 
 
-def is_whole(value: Any) -> bool:
-    """Whether a value is a whole number by its type."""
-    return isinstance(value, Integral) and not isinstance(value, bool)
-
-
-def is_number(value: Any) -> bool:
-    """Whether a value is a finite number."""
+def is_finite(value: Any) -> bool:
+    """Whether it is a number, and finite."""
     return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
 
 
@@ -45,11 +41,11 @@ def _whole(low: int) -> Kind:
 
 
 def _from(low: float) -> Kind:
-    return Kind(f"a number, {low:g} or more", lambda v: is_number(v) and v >= low)
+    return Kind(f"a number, {low:g} or more", lambda v: is_finite(v) and v >= low)
 
 
 def _between(low: float, high: float) -> Kind:
-    return Kind(f"a number in [{low:g}, {high:g}]", lambda v: is_number(v) and low <= v <= high)
+    return Kind(f"a number in [{low:g}, {high:g}]", lambda v: is_finite(v) and low <= v <= high)
 
 
 def _word(*words: str) -> Kind:
@@ -95,8 +91,8 @@ def _two_widths(critic: str) -> Kind:
 
 NONE = Kind("null (None)", lambda v: v is None)
 FLAG = Kind("true or false", lambda v: isinstance(v, bool))
-NUMBER = Kind("a number", is_number)
-POSITIVE = Kind("a number above 0", lambda v: is_number(v) and v > 0)
+NUMBER = Kind("a number", is_finite)
+POSITIVE = Kind("a number above 0", lambda v: is_finite(v) and v > 0)
 SHARE = _between(0, 1)
 MAPPING = Kind("a mapping of names to values", lambda v: isinstance(v, Mapping))
 CODE = Kind("a text of Python, dict(...)", lambda v: isinstance(v, str) and bool(v.strip()))
@@ -144,7 +140,7 @@ ALGORITHM: dict[str, Kind] = {
     "learning_starts": _whole(0),
     "line_search_max_iter": STEPS,
     "line_search_shrinking_factor": Kind(
-        "a number above 0 and below 1", lambda v: is_number(v) and 0 < v < 1
+        "a number above 0 and below 1", lambda v: is_finite(v) and 0 < v < 1
     ),
     "max_grad_norm": Kind(
         "a number above 0 (.inf clips nothing)",
@@ -201,7 +197,7 @@ ZOO: dict[str, Kind] = {
     "n_envs": STEPS,
     "n_timesteps": Kind(
         "a whole number, 1 or more, e.g. 100000 or !!float 1e5",
-        lambda v: is_number(v) and v >= 1 and v == int(v),
+        lambda v: is_finite(v) and v >= 1 and v == int(v),
     ),
     "noise_std": _from(0),
     "noise_type": _word("normal", "ornstein-uhlenbeck") | NONE,

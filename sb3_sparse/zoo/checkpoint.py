@@ -2,35 +2,26 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import signal
 import sys
 import threading
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 
-from filelock import FileLock, Timeout
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_sparse.errors import RunBusy
 from sb3_sparse.files import sync
-from sb3_sparse.zoo.disk import writing
 from sb3_sparse.zoo.divergence import check_networks
 from sb3_sparse.zoo.evaluation import Evaluation
-from sb3_sparse.zoo.record import write_record
+from sb3_sparse.zoo.folder import MONITOR, REPLAY_BUFFER, VECNORMALIZE, RunFolder, env_name
 from sb3_sparse.zoo.replay import BufferSaver
 
-FOLDER = "resume"
-REPLAY_BUFFER = "replay_buffer"
-MONITOR = ".monitor.csv"
-LOCK = ".lock"
 SECONDS = 120.0  # of training, that a kill may cost where evaluations are far apart
-PATIENCE = 1.0  # seconds; others hold the lock for a moment to see whether it is free
 
 
 class StopTraining(Exception):
@@ -45,14 +36,14 @@ class Checkpoints(BaseCallback):
     and normalisation lie in it as rl-zoo's ``--trained-agent`` reads them.
 
     :param folder: of the run
-    :param env_name: file name of the model
+    :param env_id: environment that the model is trained in
     :param evaluation: whose evaluations belong to the checkpoint
     """
 
-    def __init__(self, folder: Path, env_name: str, evaluation: Evaluation) -> None:
+    def __init__(self, folder: RunFolder, env_id: str, evaluation: Evaluation) -> None:
         super().__init__()
-        self.parent_folder = folder / FOLDER
-        self.env_name = env_name
+        self.folder = folder
+        self.env_name = env_name(env_id)
         self.evaluation = evaluation
         self.stop_wanted = False
         self.buffer: BufferSaver | None = None
@@ -81,10 +72,11 @@ class Checkpoints(BaseCallback):
         :raises Diverged: if its networks hold NaN; the checkpoint before stays
         """
         check_networks(self.model)
-        final = self.parent_folder / str(self.model.num_timesteps)
+        parent = self.folder.checkpoints
+        final = parent / str(self.model.num_timesteps)
         if final.exists():
             return
-        new = self.parent_folder / "unfinished"
+        new = parent / "unfinished"
         shutil.rmtree(new, ignore_errors=True)
         try:
             self._write(new, final)
@@ -92,9 +84,9 @@ class Checkpoints(BaseCallback):
             shutil.rmtree(new, ignore_errors=True)
             raise
         new.rename(final)
-        sync(self.parent_folder)
-        write_record(self.parent_folder.parent, num_timesteps=self.model.num_timesteps)
-        for other in self.parent_folder.iterdir():
+        sync(parent)
+        self.folder.write(num_timesteps=self.model.num_timesteps)
+        for other in parent.iterdir():
             if other != final:
                 shutil.rmtree(other)
 
@@ -108,9 +100,9 @@ class Checkpoints(BaseCallback):
             self.buffer.last = final / REPLAY_BUFFER
         normalization = self.model.get_vec_normalize_env()
         if normalization is not None:
-            normalization.save(str(new / self.env_name / "vecnormalize.pkl"))
+            normalization.save(str(new / self.env_name / VECNORMALIZE))
         self.evaluation.save(new)
-        for path in self.parent_folder.parent.glob(f"*{MONITOR}"):
+        for path in self.folder.path.glob(f"*{MONITOR}"):
             shutil.copy(path, new / path.name)
         sync(*new.rglob("*"), new)
 
@@ -139,12 +131,6 @@ class Checkpoints(BaseCallback):
         finally:
             for number, handler in before.items():
                 signal.signal(number, handler)
-
-
-def last_checkpoint(folder: Path) -> Path | None:
-    """The newest complete checkpoint of a run; None if it has none."""
-    found = [path for path in (folder / FOLDER).glob("*") if path.name.isdigit()]
-    return max(found, key=lambda path: int(path.name), default=None)
 
 
 @contextmanager
@@ -181,74 +167,3 @@ def _replace_monitors(folder: Path, contents: Mapping[Path, bytes]) -> None:
         path.unlink()
     for path, content in contents.items():
         path.write_bytes(content)
-
-
-@contextmanager
-def locked(folder: Path) -> Iterator[None]:
-    """Within it, no other process trains the run.
-
-    :raises RunBusy: if one does already
-    :raises Unwritable: if the folder cannot be written to
-    """
-    lock = FileLock(folder / LOCK)
-    try:
-        with writing(folder, "free space or make it writable, and give the command again"):
-            lock.acquire(timeout=PATIENCE)
-    except Timeout as error:
-        raise RunBusy(f"another process is at work in {folder}") from error
-    try:
-        yield
-    finally:
-        with suppress(OSError):  # Windows keeps an open file
-            (folder / LOCK).unlink()
-        lock.release()
-
-
-def is_locked(folder: Path) -> bool:
-    """Whether some process trains the run now; nothing is written."""
-    try:
-        descriptor = os.open(folder / LOCK, os.O_RDONLY)
-    except FileNotFoundError:
-        return False
-    try:
-        return not _can_lock(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-def _can_lock(descriptor: int) -> bool:
-    if sys.platform == "win32":
-        import msvcrt
-
-        try:
-            msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
-            msvcrt.locking(descriptor, msvcrt.LK_UNLCK, 1)
-        except OSError:
-            return False
-        return True
-    import fcntl
-
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)  # gone when it is closed
-    except BlockingIOError:
-        return False
-    return True
-
-
-def keep_last_finite(folder: Path, env_name: str) -> int | None:
-    """Make the model of the last checkpoint a diverged run's last policy.
-
-    :return: after how many environment steps it was saved; None if there is no checkpoint
-    """
-    checkpoint = last_checkpoint(folder)
-    if checkpoint is None:
-        return None
-    shutil.copy(checkpoint / f"{env_name}.zip", folder / f"{env_name}.zip")
-    for path in (checkpoint / env_name).iterdir():  # its normalisation
-        shutil.copy(path, folder / env_name / path.name)
-    return int(checkpoint.name)
-
-
-def clear_checkpoints(folder: Path) -> None:
-    """Remove what only an interrupted run needs."""
-    shutil.rmtree(folder / FOLDER, ignore_errors=True)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 import torch as th
@@ -17,11 +16,10 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from sb3_sparse.algorithms.training import Fused
 from sb3_sparse.engine.native.library import in_use, why_missing
 from sb3_sparse.errors import CorruptStateError
-from sb3_sparse.loading.guard import reading
 from sb3_sparse.policies.base import BaseSparsePolicy
 from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.policies.report import COMPUTES, SPARSE
-from sb3_sparse.zoo.record import CURE, NAME, WHAT
+from sb3_sparse.zoo.record import CURE, Record
 
 FUSED, OWN = "fused", "SB3's own"
 """Ways in which gradient steps run."""
@@ -79,19 +77,18 @@ def gradient_steps_of(model: BaseAlgorithm) -> str:
     return FUSED if why is None else f"{OWN}: {why}"
 
 
-def computing_at(model: BaseAlgorithm, record: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+def computing_at(model: BaseAlgorithm, record: Record) -> dict[str, Any]:
     """What a run's record shall say of how it computes, when a sitting begins.
 
     A sitting that began at the model's step or later is not part of the run: it was killed before
     its first checkpoint.
 
     :param model: with a sparse policy
-    :param record: what the run's record says so far
-    :param folder: of the run
+    :param record: the run's, so far
     """
     policy = unwrapped(model.policy)
     assert isinstance(policy, BaseSparsePolicy)
-    known = computing_in(record, folder)
+    known = computing_in(record)
     now = Sitting(
         model.num_timesteps,
         None if why_missing() else in_use(),
@@ -105,15 +102,14 @@ def computing_at(model: BaseAlgorithm, record: Mapping[str, Any], folder: Path) 
     return asdict(Computing(policy.sparsity_config.compute, (*earlier, now)))
 
 
-def computing_in(record: Mapping[str, Any], folder: Path) -> Computing | None:
+def computing_in(record: Record) -> Computing | None:
     """What a run's record says of how it computes; None in records of older versions.
 
-    :param folder: of the run
     :raises CorruptStateError: if it is damaged
     """
     if "computing" not in record:
         return None
-    with reading(folder / NAME, WHAT, CURE):
+    with record.reading():
         found = record["computing"]
         sittings = tuple(
             Sitting(**{**one, "layers": _read(one["layers"])}) for one in found["sittings"]
@@ -126,14 +122,13 @@ def computing_in(record: Mapping[str, Any], folder: Path) -> Computing | None:
         return Computing(str(found["asked"]), sittings)
 
 
-def layers_in(record: Mapping[str, Any], folder: Path) -> dict[tuple[str, int], str]:
+def layers_in(record: Record) -> dict[tuple[str, int], str]:
     """How each layer of a run computes, or did when it was last saved, by name and nnz.
 
-    :param folder: of the run
     :return: empty in records of older versions
     :raises CorruptStateError: if it is damaged
     """
-    with reading(folder / NAME, WHAT, CURE):
+    with record.reading():
         layers = [one for one in record.get("layers", []) if "compute" in one]
         how = _read({str(one["name"]): one["compute"] for one in layers})
         return {(str(one["name"]), int(one["nnz"])): how[str(one["name"])] for one in layers}
@@ -151,3 +146,27 @@ def _read(layers: Mapping[str, Any]) -> dict[str, str]:
                 f"{name} computes {how!r}, which is none of {', '.join(COMPUTES)}; {CURE}"
             )
     return found
+
+
+def counts_of(policy: BaseSparsePolicy) -> dict[str, Any]:
+    """A policy's connections, parameters and FLOPs now: in total, by network and layer by layer.
+
+    ``wanted_nnz`` are the active connections that its settings ask for.
+    """
+    report = policy.sparsity_report()
+    networks = dict.fromkeys(layer.network for layer in report.layers)
+    return {
+        "total": {
+            "sparsity": report.sparsity(),
+            "nnz": report.nnz,
+            "wanted_nnz": report.nnz + sum(one.final_nnz - one.nnz for one in policy.sparse.layers),
+            "parameters": report.parameters,
+            "flops": sum(layer.flops for layer in report.layers),
+            "dense_flops": sum(layer.dense_flops for layer in report.layers),
+        },
+        "networks": {name: {"sparsity": report.sparsity(name)} for name in networks},
+        "layers": [
+            {**asdict(layer), "size": layer.size, "density": layer.density}
+            for layer in report.layers
+        ],
+    }

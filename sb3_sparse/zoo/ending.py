@@ -4,69 +4,61 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_sparse.errors import Diverged, SparsityError, Unwritable, command
-from sb3_sparse.zoo.checkpoint import (
-    StopTraining,
-    clear_checkpoints,
-    keep_last_finite,
-    last_checkpoint,
-)
+from sb3_sparse.zoo.checkpoint import StopTraining
 from sb3_sparse.zoo.disk import refusal
 from sb3_sparse.zoo.divergence import check_networks
-from sb3_sparse.zoo.record import DIVERGED, write_record
+from sb3_sparse.zoo.folder import RunFolder
+from sb3_sparse.zoo.record import Status
 
 
 @contextmanager
-def recorded(folder: Path, env_name: str, model: BaseAlgorithm) -> Iterator[None]:
-    """Within it, whatever ends a run goes on record.
+def recorded(folder: RunFolder, env_id: str, model: BaseAlgorithm) -> Iterator[None]:
+    """Put on record whatever ends the run within.
 
-    :param folder: of the run
-    :param env_name: file name of its model
     :raises Diverged: with what is left of the run
-    :raises Unwritable: with how to go on
+    :raises Unwritable: with how to resume
     """
     try:
         yield
     except Diverged as error:
-        raise _diverged(folder, env_name, model, error) from error
+        raise _diverged(folder, env_id, model, error) from error
     except Exception as error:
-        refused = refusal(error, folder)
+        refused = refusal(error, folder.path)
         try:
             reason = f"{type(error).__name__}: {error}" if refused is None else refused
-            write_record(folder, status="failed", error=reason)
+            folder.write(status=Status.FAILED, error=reason)
         except OSError:
             if refused is None:
                 raise  # else the record stays at "running", as of a run that was killed
         if refused is None:
             raise
-        raise Unwritable(f"{refused}. {_how_to_go_on(folder, model)}") from error
+        raise Unwritable(f"{refused}. {_how_to_resume(folder, model)}") from error
 
 
-def _diverged(folder: Path, env_name: str, model: BaseAlgorithm, error: Diverged) -> Diverged:
-    """Keep the last policy of numbers."""
-    step = keep_last_finite(folder, env_name)
+def _diverged(folder: RunFolder, env_id: str, model: BaseAlgorithm, error: Diverged) -> Diverged:
+    """Keep the last policy whose networks are finite."""
+    step = folder.take_last_checkpoint(env_id)
     kept = (
         "no policy was saved before" if step is None else f"the last policy is that of step {step}"
     )
-    write_record(
-        folder,
-        status=DIVERGED,
-        error=f"{error}. In {folder.name} {kept}",  # which other machines read, too
+    folder.write(
+        status=Status.DIVERGED,
+        error=f"{error}. In {folder.path.name} {kept}",  # which other machines read, too
         num_timesteps=model.num_timesteps,
         last_policy=step,
     )
-    clear_checkpoints(folder)
+    folder.clear_checkpoints()
     return Diverged(f"{error}. In {folder} {kept}")
 
 
-def _how_to_go_on(folder: Path, model: BaseAlgorithm) -> str:
+def _how_to_resume(folder: RunFolder, model: BaseAlgorithm) -> str:
     if model.num_timesteps == 0:
         return "Nothing was trained yet; free space or make it writable, and start again"
-    checkpoint = last_checkpoint(folder)
+    checkpoint = folder.last_checkpoint()
     kept = "from its start" if checkpoint is None else f"from step {checkpoint.name}"
     return (
         f"The run stopped at step {model.num_timesteps}. Free space or make the folder writable; "
@@ -76,7 +68,7 @@ def _how_to_go_on(folder: Path, model: BaseAlgorithm) -> str:
 
 @contextmanager
 def diverging(model: BaseAlgorithm) -> Iterator[None]:
-    """Within it, an error of networks that hold NaN, which may say anything, is said to be that."""
+    """Raise Diverged for whatever error networks that hold NaN cause within."""
     try:
         yield
     except (SparsityError, StopTraining):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -96,9 +97,8 @@ def known_environment(env_id: str) -> None:
     :raises ConfigError: if Gymnasium has none of this id
     :raises MissingExtra: if it is an Atari game, and ale-py or OpenCV is not installed
     """
-    looks_atari = "NoFrameskip" in env_id or env_id.startswith("ALE/")
     has_atari = register_atari()
-    if looks_atari and not (has_atari and importlib.util.find_spec("cv2")):
+    if suite_of(env_id) == ATARI and not (has_atari and importlib.util.find_spec("cv2")):
         raise MissingExtra(env_id, "atari")
     if env_id not in gym.registry:
         raise ConfigError(
@@ -112,3 +112,35 @@ def known_environment(env_id: str) -> None:
 def is_atari(env_id: str) -> bool:
     """Whether it is an Atari game, told as rl-zoo tells it."""
     return "AtariEnv" in str(gym.registry[env_id].entry_point)
+
+
+ATARI = "Atari"
+CLASSIC_CONTROL = ("CartPole", "Acrobot", "MountainCar", "MountainCarContinuous", "Pendulum")
+MUJOCO = (
+    "Ant",
+    "HalfCheetah",
+    "Hopper",
+    "Humanoid",
+    "HumanoidStandup",
+    "InvertedDoublePendulum",
+    "InvertedPendulum",
+    "Pusher",
+    "Reacher",
+    "Swimmer",
+    "Walker2d",
+)
+
+
+def game_of(env_id: str) -> str:
+    """Name of a task without its version, e.g. ``"Pong"`` of ``"ALE/Pong-v5"``."""
+    name = re.sub(r"-v\d+$", "", env_id.split("/")[-1])
+    return re.sub(r"(-ram)?(NoFrameskip|Deterministic)?$", "", name)
+
+
+def suite_of(env_id: str) -> str:
+    """The benchmark that a task belongs to, told by its name: it need not be registered."""
+    if env_id.startswith("ALE/") or "NoFrameskip" in env_id or "Deterministic" in env_id:
+        return ATARI
+    if game_of(env_id) in CLASSIC_CONTROL:
+        return "classic control"
+    return "MuJoCo" if game_of(env_id) in MUJOCO else "other tasks"

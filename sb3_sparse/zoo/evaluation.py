@@ -23,10 +23,9 @@ from sb3_sparse.loading.zips import read_model
 from sb3_sparse.policies.base import BaseSparsePolicy
 from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.zoo.divergence import check_networks, check_return
+from sb3_sparse.zoo.folder import BEST, EVALUATIONS
 from sb3_sparse.zoo.watch import Watch
 
-NPZ = "evaluations.npz"
-BEST = "best_model.zip"
 STATE = "evaluation.json"
 UNFINISHED = "unfinished"
 CURE = (
@@ -72,7 +71,7 @@ class Evaluated:
             read_model(path)
         if count == 0:
             return cls(best)
-        needed, path = ("timesteps", "results", "ep_lengths"), folder / NPZ
+        needed, path = ("timesteps", "results", "ep_lengths"), folder / EVALUATIONS
         saved = read_arrays(path, what, CURE, needed)
         steps, *episodes = (saved[name].shape for name in needed)
         if steps != (count,) or any(one[:1] != steps or len(one) != 2 for one in episodes):
@@ -135,13 +134,13 @@ class Evaluation(EvalCallback):
         """Save the evaluations so far, and the best model by them."""
         state = {"best_mean_reward": self.best_mean_reward, "count": self.count}
         (folder / STATE).write_text(json.dumps(state))
-        for name in (NPZ, BEST):
+        for name in (EVALUATIONS, BEST):
             if (self.folder / name).is_file():
                 shutil.copy(self.folder / name, folder / name)
 
     def forget(self) -> None:
         """Remove what a run that is started anew has evaluated before."""
-        for name in (NPZ, BEST):
+        for name in (EVALUATIONS, BEST):
             (self.folder / name).unlink(missing_ok=True)
 
     def restore(self, folder: Path) -> None:
@@ -150,7 +149,7 @@ class Evaluation(EvalCallback):
         :raises CorruptStateError: if something of it is damaged; then all stays as it is
         """
         saved = Evaluated.read(folder)
-        for name in (NPZ, BEST):
+        for name in (EVALUATIONS, BEST):
             if (folder / name).is_file():
                 with written_whole(self.folder / name) as new:
                     shutil.copy(folder / name, new)

@@ -12,10 +12,9 @@ from sb3_sparse.loading.zips import check_state, look_into
 from sb3_sparse.policies.report import SPARSE, SparsityReport
 from sb3_sparse.policies.storage import KNOWN_PACKAGES
 from sb3_sparse.zoo.computing import Computing, computing_in, layers_in
-from sb3_sparse.zoo.folder import arguments_of, is_run, model_in, zip_path
 from sb3_sparse.zoo.outline import Outline, outline_of
 from sb3_sparse.zoo.positions import image_in
-from sb3_sparse.zoo.record import NAME, read_record
+from sb3_sparse.zoo.saved import locate
 
 
 @dataclass(frozen=True)
@@ -48,25 +47,23 @@ class Inspection:
         return ["compute='auto' keeps masks: no linear layer is large and sparse enough"]
 
 
-def inspect_model(path: Path) -> Inspection:
+def inspect_model(path: Path, best: bool = False) -> Inspection:
     """The sparsity report of a saved model, and how its layers compute.
 
     Nothing is unpickled and no class that the file names is imported, so that a stranger's file can
     be looked into.
 
     :param path: a run's folder, or a zip that SB3 saved, whichever algorithm trained it
+    :param best: of a folder, the best policy instead of the last
     :raises ConfigError: if there is no such file, or no sparse policy in it
     :raises CorruptStateError: if the file is damaged, or the run's record
     :raises Diverged: if the network is not finite
     """
-    path = path if is_run(path) else zip_path(path)  # a run has a folder of its environment's name
-    folder = path if path.is_dir() else path.parent
-    if path.is_dir():
-        path = model_in(folder, arguments_of(folder)["env"], False)
+    path, folder = locate(path, best)
     computing, recorded = None, {}
-    if is_run(folder) and (folder / NAME).is_file():  # rl-zoo's own runs have no record
-        record = read_record(folder)
-        computing, recorded = computing_in(record, folder), layers_in(record, folder)
+    if folder.is_run and folder.has_record:
+        record = folder.record()
+        computing, recorded = computing_in(record), layers_in(record)
     contents = look_into(path)
     check_state(contents.state, str(path))
     outline = outline_of(

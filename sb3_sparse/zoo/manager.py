@@ -1,4 +1,4 @@
-"""The run engine: rl_zoo3's ExperimentManager with the settings and callbacks of this package."""
+"""rl_zoo3's ExperimentManager with the settings and callbacks of this package."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from argparse import Namespace
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, redirect_stdout
-from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +18,10 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_sparse.errors import MissingExtra, warn
 from sb3_sparse.policies.saving import load_without_buffer
-from sb3_sparse.zoo.checkpoint import REPLAY_BUFFER
+from sb3_sparse.zoo.folder import REPLAY_BUFFER, RunFolder, Start
 from sb3_sparse.zoo.mujoco import mujoco_warns_once
-from sb3_sparse.zoo.record import write_record
 from sb3_sparse.zoo.replay import end_episodes, restore_buffer
+from sb3_sparse.zoo.settings import Settings
 from sb3_sparse.zoo.spec import RunSpec, algorithms
 
 try:
@@ -33,62 +32,65 @@ except ImportError as error:
     raise MissingExtra("training runs", "zoo") from error
 
 
+ANEW = Start()
+
+
 class RunManager(ExperimentManager):
     """Makes environments, model and files as ``rl_zoo3.train`` does, for given settings.
 
     :param run: what to train
-    :param settings: the config's entry, as it shall be trained
+    :param settings: the settings to train it with
     :param folder: the run's own folder
     :param evaluation: ``eval_freq`` and ``eval_episodes``
-    :param start: folder with the model to go on with (a checkpoint, or ``folder``); None: train
-        anew
-    :param tensorboard_log: where TensorBoard's files go; empty: none
+    :param start: where to take the run up
+    :param tensorboard_log: folder of TensorBoard's files; empty: none
     """
 
     def __init__(
         self,
         run: RunSpec,
-        settings: Mapping[str, Any],
-        folder: Path,
+        settings: Settings,
+        folder: RunFolder,
         evaluation: Mapping[str, int],
-        start: Path | None = None,
+        start: Start = ANEW,
         tensorboard_log: str = "",
     ) -> None:
         self.settings = settings
         self.evaluation = evaluation
-        steps = int(start.name) if start is not None and start != folder else 0
+        self.folder = folder
+        self.start = start
+        log_folder = str(folder.path.parent.parent)
         arguments = {
             **run.as_dict(),
             **evaluation,
             "env": run.env_id,
             "env_kwargs": None,
-            "log_folder": str(folder.parent.parent),
+            "log_folder": log_folder,
             "tensorboard_log": tensorboard_log,
         }
         super().__init__(
             Namespace(**arguments),
             run.algo,
             run.env_id,
-            str(folder.parent.parent),
+            log_folder,
             tensorboard_log,
-            eval_freq=-1,  # create_callbacks leaves evaluation and checkpoints to train.py
+            eval_freq=-1,  # training.py has its own evaluation and checkpoints
             save_freq=-1,
             n_eval_episodes=evaluation["eval_episodes"],
-            seed=run.seed + steps,  # so that a resumed run does not repeat its beginning
+            seed=run.seed + start.steps,  # so that a resumed run does not repeat its beginning
             verbose=0,
             device=run.device,
             config=str(run.config),
         )
         self.save_path = str(folder)
-        self.params_path = str(folder / self.env_name)
-        if start is not None:
-            self.trained_agent = str(start / f"{self.env_name}.zip")
+        self.params_path = str(folder.parameters(run.env_id))
+        if start.folder is not None:
+            self.trained_agent = str(start.folder / f"{self.env_name}.zip")
             self.continue_training = True
-        self.trained = start == folder  # so that nothing is to be written any more
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], OrderedDict[str, Any]]:
-        """The settings, in place of the YAML file that they came from."""
-        return deepcopy(dict(self.settings)), OrderedDict(sorted(deepcopy(self.settings).items()))
+        """The settings, instead of the YAML file that they came from."""
+        return self.settings.as_dict(), OrderedDict(sorted(self.settings.as_dict().items()))
 
     def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
         """As rl-zoo makes them, but the episodes of a run that is trained stay on record.
@@ -98,7 +100,7 @@ class RunManager(ExperimentManager):
         """
         self.eval_env_kwargs = self.env_kwargs
         with mujoco_warns_once(self.env_name.gym_id):
-            envs: VecEnv = super().create_envs(n_envs, eval_env, no_log or self.trained)
+            envs: VecEnv = super().create_envs(n_envs, eval_env, no_log or self.start.trained)
         return envs
 
     def setup(self) -> BaseAlgorithm:
@@ -117,7 +119,8 @@ class RunManager(ExperimentManager):
             hyperparams = self._preprocess_action_noise(hyperparams, saved, env)
             model = self._make(hyperparams, env)
             self._save_config(saved)
-        if isinstance(model, OffPolicyAlgorithm) and self.continue_training and not self.trained:
+        resumes = self.start.folder is not None and not self.start.trained
+        if isinstance(model, OffPolicyAlgorithm) and resumes:
             self._restore_buffer(model)
         return model
 
@@ -140,13 +143,14 @@ class RunManager(ExperimentManager):
         return model
 
     def _restore_buffer(self, model: OffPolicyAlgorithm) -> None:
-        folder = Path(self.trained_agent).parent / REPLAY_BUFFER
+        assert self.start.folder is not None
+        folder = self.start.folder / REPLAY_BUFFER
         if not folder.is_dir():
             warn(
                 f"there is no replay buffer in {folder}: the run goes on with an empty one, which "
                 "trains otherwise than an uninterrupted run"
             )
-            write_record(Path(self.save_path), without_buffer_from=model.num_timesteps)
+            self.folder.write(without_buffer_from=model.num_timesteps)
             return
         assert model.replay_buffer is not None
         restore_buffer(model.replay_buffer, folder)
@@ -179,7 +183,7 @@ def quiet() -> Iterator[None]:
 
 
 def spaces_of(
-    run: RunSpec, settings: Mapping[str, Any], folder: Path, evaluation: Mapping[str, int]
+    run: RunSpec, settings: Settings, folder: RunFolder, evaluation: Mapping[str, int]
 ) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
     """Observation and action space that the policy sees, wrappers and stacking included."""
     experiment = RunManager(run, settings, folder, evaluation)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from copy import deepcopy
 from dataclasses import dataclass
 from typing import Any
@@ -16,6 +16,7 @@ from sb3_sparse.policies.base import BaseSparsePolicy
 from sb3_sparse.policies.internals import no_schedule
 from sb3_sparse.policies.registry import SparsePolicy
 from sb3_sparse.sparsity.widths import equivalent_widths
+from sb3_sparse.zoo.settings import Settings
 
 EXTRACTOR = "features_extractor_class"
 EXTRACTOR_KWARGS = "features_extractor_kwargs"
@@ -52,7 +53,7 @@ def match_parameters(
     algorithm: type[BaseAlgorithm],
     observation_space: spaces.Space[Any],
     action_space: spaces.Space[Any],
-    settings: Mapping[str, Any],
+    settings: Settings,
     sparsity: float,
 ) -> Match:
     """Scale all hidden widths (channels and dense units of an image network too) by one factor.
@@ -61,19 +62,19 @@ def match_parameters(
     :param sparsity: of the network to match, in [0, 1)
     :raises ConfigError: if the settings do not say how wide the network is
     """
-    kwargs = _with_widths(settings["policy_kwargs"], observation_space)
-    hidden = [place.get() for place in _places(kwargs)]
+    kwargs = _with_widths(settings.policy_kwargs, observation_space)
+    hidden = [int(container[key]) for container, key in _places(kwargs)]
 
     def parameters(changed: dict[str, Any]) -> int:
         policy = untrained_policy(
-            algorithm, observation_space, action_space, {**settings, "policy_kwargs": changed}
+            algorithm, observation_space, action_space, settings.replaced(policy_kwargs=changed)
         )
         return policy.sparsity_report().parameters
 
     def scaled(widths: list[int]) -> dict[str, Any]:
         changed = deepcopy(kwargs)
-        for place, width in zip(_places(changed), widths, strict=True):
-            place.set(width)
+        for (container, key), width in zip(_places(changed), widths, strict=True):
+            container[key] = width
         return changed
 
     target = parameters({**kwargs, "sparsity": sparsity})
@@ -85,10 +86,10 @@ def untrained_policy(
     algorithm: type[BaseAlgorithm],
     observation_space: spaces.Space[Any],
     action_space: spaces.Space[Any],
-    settings: Mapping[str, Any],
+    settings: Settings,
 ) -> BaseSparsePolicy:
     """A policy as the algorithm would make it from these settings, to be looked at."""
-    kwargs = deepcopy(dict(settings["policy_kwargs"]))
+    kwargs = settings.policy_kwargs
     if settings.get("use_sde"):
         kwargs["use_sde"] = True
     policy_class: Any = algorithm.policy_aliases[SparsePolicy]
@@ -112,28 +113,15 @@ def _with_widths(policy_kwargs: Mapping[str, Any], space: spaces.Space[Any]) -> 
     return kwargs
 
 
-@dataclass(frozen=True)
-class _Place:
-    """Where one width stands in the arguments."""
+def _places(kwargs: dict[str, Any]) -> Iterator[tuple[Any, Any]]:
+    """Where each hidden width stands: of net_arch, then of an image network.
 
-    get: Callable[[], int]
-    set: Callable[[int], None]
-
-
-def _places(kwargs: dict[str, Any]) -> Iterator[_Place]:
-    """Every hidden width: of net_arch, then channels and dense units of an image network."""
+    :return: list and index, or mapping and name
+    """
     arch = kwargs["net_arch"]
     extractor = kwargs.get(EXTRACTOR_KWARGS, {})
     lists = list(arch.values()) if isinstance(arch, dict) else [arch]
     for widths in [*lists, extractor.get("channels", [])]:
-        for index in range(len(widths)):
-            yield _place(widths, index)
+        yield from ((widths, index) for index in range(len(widths)))
     if "features_dim" in extractor:
-        yield _place(extractor, "features_dim")
-
-
-def _place(container: Any, key: Any) -> _Place:
-    def put(width: int) -> None:
-        container[key] = width
-
-    return _Place(get=lambda: int(container[key]), set=put)
+        yield extractor, "features_dim"

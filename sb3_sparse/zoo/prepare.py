@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -14,12 +15,16 @@ from gymnasium import spaces
 
 from sb3_sparse.errors import ConfigError, MissingExtra, SparsityError, Unwritable
 from sb3_sparse.policies.registry import registered
+from sb3_sparse.zoo.computing import counts_of
 from sb3_sparse.zoo.disk import refusal
+from sb3_sparse.zoo.folder import RunFolder
 from sb3_sparse.zoo.manager import spaces_of
 from sb3_sparse.zoo.match import Match, match_parameters, untrained_policy
-from sb3_sparse.zoo.record import sparsity_of, versions, write_record
-from sb3_sparse.zoo.settings import method_of
+from sb3_sparse.zoo.record import Status, versions
+from sb3_sparse.zoo.settings import Settings
 from sb3_sparse.zoo.spec import RunSpec
+
+PACKAGE = Path(__file__).parents[1]
 
 
 @dataclass(frozen=True)
@@ -33,7 +38,7 @@ class Prepared:
     :param action_space: that it acts in
     """
 
-    settings: dict[str, Any]
+    settings: Settings
     evaluation: dict[str, int]
     observation_space: spaces.Space[Any]
     action_space: spaces.Space[Any]
@@ -43,7 +48,7 @@ class Prepared:
         """What ``sparsity.json`` says of the run from its start."""
         match = {} if self.match is None else {"match": asdict(self.match)}
         return {
-            "method": method_of(self.settings),
+            "method": self.settings.method,
             "run": run.as_dict(),
             "settings": self.settings,
             "evaluation": self.evaluation,
@@ -60,9 +65,9 @@ def prepare(run: RunSpec, log_folder: Path) -> Prepared:
     """
     check_device(run.device)
     settings, evaluation = run.settings(), run.evaluation()
-    with explained(doubt(run), run.env_id):
+    with setup_errors(settings_fail(run), run.env_id):
         observation_space, action_space = spaces_of(
-            run, settings, log_folder / run.algo / "new", evaluation
+            run, settings, RunFolder(log_folder / run.algo / "new"), evaluation
         )
     check_action_space(run, action_space)
     match = None
@@ -70,7 +75,7 @@ def prepare(run: RunSpec, log_folder: Path) -> Prepared:
         match = match_parameters(
             run.algorithm, observation_space, action_space, settings, run.match_params
         )
-        settings["policy_kwargs"] = match.policy_kwargs
+        settings = settings.replaced(policy_kwargs=match.policy_kwargs)
     return Prepared(settings, evaluation, observation_space, action_space, match)
 
 
@@ -90,7 +95,7 @@ def check_device(device: str) -> None:
         ) from error
 
 
-def count(run: RunSpec, folder: Path) -> None:
+def count(run: RunSpec, folder: RunFolder) -> None:
     """Record what a run's networks would hold and cost, in a folder of its own; no training.
 
     Networks that would be pruned are counted as they end, not as they begin.
@@ -98,28 +103,30 @@ def count(run: RunSpec, folder: Path) -> None:
     :param folder: as of :func:`sb3_sparse.zoo.training.train`
     :raises ConfigError: as :func:`prepare`
     """
-    prepared = prepare(run, folder.parent.parent)
-    kwargs = {**prepared.settings["policy_kwargs"], "initial_sparsity": None}
+    prepared = prepare(run, folder.path.parent.parent)
+    kwargs = {**prepared.settings.policy_kwargs, "initial_sparsity": None}
     policy = untrained_policy(
         run.algorithm,
         prepared.observation_space,
         prepared.action_space,
-        {**prepared.settings, "policy_kwargs": kwargs},
+        prepared.settings.replaced(policy_kwargs=kwargs),
     )
-    folder.mkdir(parents=True, exist_ok=True)
-    write_record(folder, status="counted", **prepared.record(run), **sparsity_of(policy))
+    folder.path.mkdir(parents=True, exist_ok=True)
+    folder.write(status=Status.COUNTED, **prepared.record(run), **counts_of(policy))
 
 
-def doubt(run: RunSpec) -> str:
+def settings_fail(run: RunSpec) -> str:
     """What to say when an environment or algorithm fails before training."""
     return f"the settings of {run.env_id} in {run.config}, with what you changed, do not work"
 
 
 @contextmanager
-def explained(failure: str, env_id: str) -> Iterator[None]:
-    """Turn what environment, zoo and algorithm raise before training into one of our errors.
+def setup_errors(failure: str, env_id: str) -> Iterator[None]:
+    """Turn what environment, zoo and algorithm raise before training into a ConfigError.
 
-    :param failure: what does not work then
+    An error that this package raises itself is a bug of it, and keeps its traceback.
+
+    :param failure: what fails then, for the message
     """
     try:
         yield
@@ -133,6 +140,8 @@ def explained(failure: str, env_id: str) -> Iterator[None]:
         refused = refusal(error, Path())
         if refused is not None:
             raise Unwritable(f"{refused}; free space, or make the folder writable") from error
+        if _raised_here(error):
+            raise
         raise ConfigError(f"{failure}: {type(error).__name__}: {error}") from error
 
 
@@ -151,3 +160,9 @@ def check_action_space(run: RunSpec, space: spaces.Space[Any]) -> None:
             f"{run.algo} cannot act in {run.env_id}, whose actions are {space}; "
             + (f"take {' or '.join(able)}" if able else "no algorithm can")
         )
+
+
+def _raised_here(error: BaseException) -> bool:
+    """Whether code of this package raised an error, rather than code that it called."""
+    frames = [frame.f_code.co_filename for frame, _ in traceback.walk_tb(error.__traceback__)]
+    return Path(frames[-1]).is_relative_to(PACKAGE)

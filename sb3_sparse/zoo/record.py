@@ -1,26 +1,27 @@
-"""``sparsity.json``: what a run was asked for, what came out, and how sparse it is."""
+"""What ``sparsity.json`` says of a run: what it was asked for, what came out, how sparse it is."""
 
 from __future__ import annotations
 
 import json
 import platform
-from collections.abc import Mapping
-from dataclasses import asdict
+from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager
+from enum import Enum
+from functools import cached_property
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from sb3_sparse.errors import ConfigError, CorruptStateError
-from sb3_sparse.files import written_whole
-from sb3_sparse.loading.text import read_json
-from sb3_sparse.policies.base import BaseSparsePolicy
+from sb3_sparse.errors import CorruptStateError
+from sb3_sparse.loading.guard import reading
+from sb3_sparse.sparsity.numeric import is_whole
+from sb3_sparse.zoo.settings import Settings
+from sb3_sparse.zoo.spec import RunSpec
 
 NAME = "sparsity.json"
 WHAT = "record of a run"
 CURE = "restore it from a copy, or remove the run's folder and train anew"
 FORMAT = 1
-DIVERGED = "diverged"
-"""Status of a run whose networks came to hold NaN: it is over, and nothing of it is averaged."""
 PACKAGES = (
     "sb3-sparse",
     "stable-baselines3",
@@ -32,30 +33,124 @@ PACKAGES = (
 )
 
 
-def write_record(folder: Path, **content: Any) -> None:
-    """Write the file, whole or not at all. What it had under other names stays."""
-    path = folder / NAME
-    known = read_json(path, WHAT, CURE) if path.is_file() else {"format": FORMAT}
-    with written_whole(path) as new:
-        new.write_text(json.dumps({**known, **content}, indent=1, default=_plain) + "\n")
+class Status(str, Enum):
+    """How far a run is."""
+
+    RUNNING = "running"
+    """It trains, or was killed while it did."""
+    INTERRUPTED = "interrupted"
+    """A signal stopped it; it resumes from its last checkpoint."""
+    EVALUATING = "evaluating"
+    """It is trained, and its last and best policies are evaluated."""
+    FINISHED = "finished"
+    COUNTED = "counted"
+    """Its networks were built and counted, and never trained."""
+    DIVERGED = "diverged"
+    """Its networks came to hold NaN or infinity. It cannot resume, and no report averages it."""
+    FAILED = "failed"
+    """It raised an error, which the record holds; it resumes from its last checkpoint."""
+    PRUNED = "pruned"
+    """A search stopped it early."""
+
+    __str__ = str.__str__
+
+    @property
+    def is_over(self) -> bool:
+        """Whether nothing of the run is left to do."""
+        return self in (Status.FINISHED, Status.COUNTED, Status.DIVERGED)
 
 
-def read_record(folder: Path) -> dict[str, Any]:
-    """The content of a run's file.
+class Record(Mapping[str, Any]):
+    """The content of a run's ``sparsity.json``, or of its line in an archive.
 
-    :raises ConfigError: if the folder has none
-    :raises CorruptStateError: if it is damaged
+    A mapping of all that the file holds. The properties check what they return.
+
+    :param content: the file's mapping
+    :param source: the file, for messages
+    :param cure: what to do if it is damaged, for messages
+    :raises CorruptStateError: if the status or the format is unknown
     """
-    path = folder / NAME
-    if not path.is_file():
-        raise ConfigError(
-            f"there is no run of sb3-sparse in {folder} (it would hold {NAME}); give the run's own "
-            "folder, e.g. logs/sac/HalfCheetah-v5_1"
-        )
-    content = read_json(path, WHAT, CURE)
-    if not isinstance(content.get("status"), str):
-        raise CorruptStateError(f"{path} is damaged: it has no status; {CURE}")
-    return content
+
+    def __init__(
+        self, content: Mapping[str, Any], source: Path = Path(NAME), cure: str = CURE
+    ) -> None:
+        self.source = source
+        self.cure = cure
+        self._content = content
+        number = content.get("format", FORMAT)
+        if not is_whole(number) or number > FORMAT:
+            raise CorruptStateError(
+                f"{source} has the format {number!r}, and this sb3-sparse reads up to {FORMAT}; "
+                f"update sb3-sparse, or {cure}"
+            )
+        try:
+            self.status = Status(content.get("status"))
+        except ValueError as error:
+            found = f"the status {content['status']!r}" if "status" in content else "no status"
+            raise CorruptStateError(f"{source} is damaged: it has {found}; {cure}") from error
+
+    def __getitem__(self, name: str) -> Any:
+        return self._content[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._content)
+
+    def __len__(self) -> int:
+        return len(self._content)
+
+    def reading(self) -> AbstractContextManager[None]:
+        """Turn what a missing or mistyped entry raises within into a CorruptStateError."""
+        return reading(self.source, WHAT, self.cure)
+
+    @property
+    def num_timesteps(self) -> int:
+        """Environment steps trained."""
+        with self.reading():
+            return int(self.get("num_timesteps", 0))
+
+    @property
+    def measured(self) -> Mapping[str, Any]:
+        """Arguments of what was measured of the trained model, by the measure's name."""
+        with self.reading():
+            return dict(self.get("measured", {}))
+
+    @cached_property
+    def spec(self) -> RunSpec:
+        """What is trained.
+
+        :raises ConfigError: if it cannot be made here, e.g. an environment is not registered
+        """
+        with self.reading():
+            return RunSpec(**self["run"])
+
+    @cached_property
+    def settings(self) -> Settings:
+        """The settings it is trained with. Nothing that they name is imported."""
+        with self.reading():
+            return Settings(self._mapping("settings"), imports=False)
+
+    @property
+    def evaluation(self) -> dict[str, int]:
+        """``eval_freq`` and ``eval_episodes``."""
+        with self.reading():
+            found = self._mapping("evaluation")
+            for name in ("eval_freq", "eval_episodes"):
+                if not is_whole(found[name]) or found[name] < 1:
+                    raise CorruptStateError(
+                        f"{self.source} is damaged: {name} is {found[name]!r}; {self.cure}"
+                    )
+            return dict(found)
+
+    def _mapping(self, name: str) -> Mapping[str, Any]:
+        found = self[name]
+        if not isinstance(found, Mapping):
+            raise CorruptStateError(f"{self.source} is damaged: {name} is {found!r}; {self.cure}")
+        return found
+
+
+def as_json(content: Mapping[str, Any]) -> str:
+    """The text of a record's file."""
+    return json.dumps(dict(content), indent=1, default=_plain) + "\n"
 
 
 def _plain(value: Any) -> Any:
@@ -75,27 +170,3 @@ def versions() -> dict[str, str]:
         except PackageNotFoundError:
             continue
     return found
-
-
-def sparsity_of(policy: BaseSparsePolicy) -> dict[str, Any]:
-    """Counts of a policy as it is now: in total, by network and layer by layer.
-
-    ``wanted_nnz`` are the active connections that its settings ask for.
-    """
-    report = policy.sparsity_report()
-    networks = dict.fromkeys(layer.network for layer in report.layers)
-    return {
-        "total": {
-            "sparsity": report.sparsity(),
-            "nnz": report.nnz,
-            "wanted_nnz": report.nnz + sum(one.final_nnz - one.nnz for one in policy.sparse.layers),
-            "parameters": report.parameters,
-            "flops": sum(layer.flops for layer in report.layers),
-            "dense_flops": sum(layer.dense_flops for layer in report.layers),
-        },
-        "networks": {name: {"sparsity": report.sparsity(name)} for name in networks},
-        "layers": [
-            {**asdict(layer), "size": layer.size, "density": layer.density}
-            for layer in report.layers
-        ],
-    }

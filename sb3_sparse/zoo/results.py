@@ -18,6 +18,7 @@ from sb3_sparse.loading.guard import reading
 from sb3_sparse.policies.base import BaseSparsePolicy
 from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.zoo.divergence import check_return
+from sb3_sparse.zoo.folder import BEST
 from sb3_sparse.zoo.spec import RunSpec
 from sb3_sparse.zoo.watch import Watch, counting
 
@@ -128,7 +129,7 @@ def final_results(
         return Result(what, float(mean), float(std), episodes, path)
 
     results = [result("Last policy", path)]
-    best = path.with_name("best_model.zip")
+    best = path.with_name(BEST)
     if best.is_file():
         last: Any = deepcopy(model.get_parameters())
         with reading(best, "best model of this run", "remove it, and resume the run"):

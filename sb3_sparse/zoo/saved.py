@@ -1,4 +1,4 @@
-"""A model on disk, and what is known of where it was trained."""
+"""A model on disk: loading it, and making the environments that it was trained in."""
 
 from __future__ import annotations
 
@@ -8,47 +8,76 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
+import yaml
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import check_for_correct_spaces
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper, VecFrameStack
 
-from sb3_sparse.errors import ConfigError, CorruptStateError
+from sb3_sparse.errors import ConfigError, CorruptStateError, MissingExtra, SparsityError
 from sb3_sparse.loading.guard import reading
+from sb3_sparse.loading.statistics import load_statistics, read_statistics
+from sb3_sparse.loading.text import read_text
 from sb3_sparse.loading.zips import check_state, look_into, read_model
+from sb3_sparse.loading.zooyaml import NotBuilt
+from sb3_sparse.policies.arguments import import_path
+from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.policies.internals import COUNTERS, LAST_SEEN, wrapped
 from sb3_sparse.policies.registry import writers_of
 from sb3_sparse.policies.saving import differ
-from sb3_sparse.zoo.arguments import Kind, is_whole, kind_of
-from sb3_sparse.zoo.environments import import_packages, package_names
+from sb3_sparse.sparsity.numeric import is_whole
+from sb3_sparse.zoo.arguments import Kind, kind_of
+from sb3_sparse.zoo.environments import (
+    import_packages,
+    is_atari,
+    known_environment,
+    package_names,
+)
 from sb3_sparse.zoo.folder import (
     ARGUMENTS,
     CONFIG,
+    RESTORE,
     VECNORMALIZE,
-    arguments_of,
+    RunFolder,
     environment_in,
     environment_settings,
-    is_run,
-    model_in,
-    params_of,
     zip_path,
 )
 from sb3_sparse.zoo.manager import load_for_prediction, loadable_algorithms, quiet
-from sb3_sparse.zoo.spec import algorithms
+from sb3_sparse.zoo.mujoco import mujoco_warns_once
+from sb3_sparse.zoo.prepare import setup_errors
+from sb3_sparse.zoo.spec import RunSpec, algorithms
+
+try:
+    from rl_zoo3.utils import create_test_env
+except ImportError as error:
+    raise MissingExtra("the environments of a saved model", "zoo") from error
 
 COUNTED = ("num_timesteps", *COUNTERS)
 WHOLE = Kind("a whole number, 0 or more", lambda v: is_whole(v) and v >= 0)
+EVALUATION_ENVS = 10
 
 
 @dataclass(frozen=True)
-class Saved:
-    """A saved model.
+class SavedModel:
+    """A saved model, and what is known of where it was trained. :meth:`find` makes one.
+
+    Example::
+
+        from sb3_sparse.zoo import RunSpec, SavedModel, train
+
+        outcome = train(RunSpec(n_timesteps=200, eval_freq=100, eval_episodes=1))
+        saved = SavedModel.find(outcome.folder, best=True)
+        model, envs = saved.load(), saved.evaluation_envs(episodes=5, seed=0)
+        print(saved.algo, saved.env_id, model.predict(envs.reset()))
 
     :param path: the zip
     :param algo: algorithm, e.g. ``"sac"``
-    :param env_id: what it was trained in; None: not known
-    :param params: folder of its run's ``config.yml`` and normalisation; None: it lies in no run
-    :param vecnormalize: statistics that its observations were normalised by; None: they were not
+    :param env_id: environment that it was trained in; None: not known
+    :param parameters: folder of its run's ``config.yml`` and normalisation; None: it lies in no run
+    :param vecnormalize: statistics that normalised its observations; None: nothing did
     :param settings: how its environments were made, by the names of
         :data:`~sb3_sparse.zoo.folder.OF_ENVIRONMENT`; empty if it lies in no run
     :param gym_packages: modules that register its environment or algorithm
@@ -57,17 +86,69 @@ class Saved:
     path: Path
     algo: str
     env_id: str | None = None
-    params: Path | None = None
+    parameters: Path | None = None
     vecnormalize: Path | None = None
     settings: Mapping[str, Any] = field(default_factory=dict)
     gym_packages: tuple[str, ...] = ()
 
+    @classmethod
+    def find(
+        cls,
+        path: Path,
+        *,
+        best: bool = False,
+        algo: str | None = None,
+        env_id: str | None = None,
+        vecnormalize: Path | None = None,
+        gym_packages: Sequence[str] = (),
+    ) -> SavedModel:
+        """Find a model and all that belongs to it.
+
+        :param path: a run's folder, of ``sb3-sparse train`` or ``rl_zoo3.train``, or a zip of SB3,
+            in such a folder or not
+        :param best: of a folder, the best policy instead of the last
+        :param algo: None: as the run's folder or the file says
+        :param env_id: None: as the run's folder says
+        :param vecnormalize: statistics of a VecNormalize; None: those in the run's folder
+        :param gym_packages: modules that register environments or algorithms, beside those that
+            the run names
+        :raises ConfigError: if there is no model, or what belongs to it is missing
+        :raises CorruptStateError: if one of the files is damaged
+        """
+        path, folder = locate(path, best)
+        arguments = folder.arguments() if folder.is_run else {}
+        env_id, packages = environment_in({**arguments, "env": env_id or arguments.get("env")})
+        packages = package_names([*packages, *gym_packages])
+        wanted = algo or arguments.get("algo")
+        if wanted is not None and wanted not in loadable_algorithms():
+            import_packages(packages)
+        parameters = folder.parameters(arguments["env"]) if arguments else None
+        if parameters is not None and arguments["algo"] not in loadable_algorithms():
+            raise CorruptStateError(
+                f"{parameters / ARGUMENTS} is damaged: algo is {arguments['algo']!r}; known are "
+                f"{', '.join(loadable_algorithms())}"
+            )
+        algo = _algo(path, algo, arguments.get("algo"))
+        settings: Mapping[str, Any] = {}
+        if parameters is not None and (vecnormalize is None or (parameters / CONFIG).is_file()):
+            settings = environment_settings(parameters)
+        if vecnormalize is None:
+            vecnormalize = _statistics_of_run(parameters, settings) if parameters else None
+        if vecnormalize is None and parameters is None:
+            _check_lone(path, algo)
+        if vecnormalize is not None and not vecnormalize.is_file():
+            raise ConfigError(
+                f"there is no file {vecnormalize}; give what VecNormalize.save wrote, e.g. "
+                f"{VECNORMALIZE}"
+            )
+        return cls(path, algo, env_id, parameters, vecnormalize, settings, packages)
+
     def load(self, env: VecEnv | None = None) -> BaseAlgorithm:
         """The model; without an environment it is fit for prediction only.
 
-        Unpickles what SB3 pickled: the file must come from somebody who is trusted.
+        Unpickles what SB3 pickled: the file must come from somebody you trust.
 
-        :param env: to go on training in
+        :param env: to train on in
         :raises ConfigError: if there is no such file, or it does not suit ``env``
         :raises CorruptStateError: if the file is damaged or of another algorithm, or if masks and
             weights in it disagree
@@ -88,12 +169,21 @@ class Saved:
             model: BaseAlgorithm = algorithms()[self.algo].load(self.path, env=env)
             return model
 
-    def check_suits(self, env: VecEnv, observations: Any, actions: Any) -> None:
-        """Refuse an environment that shows or takes something else than the model knows.
+    def policy(self) -> BasePolicy:
+        """The policy alone, for prediction.
 
-        :param observations: the model's space of them
-        :param actions: the model's space of them
-        :raises ConfigError: if so
+        :raises ConfigError: as :meth:`load`
+        :raises CorruptStateError: as :meth:`load`
+        :raises Diverged: as :meth:`load`
+        """
+        return unwrapped(self.load().policy)
+
+    def check_suits(self, env: VecEnv, observations: Any, actions: Any) -> None:
+        """Reject an environment whose spaces are not the model's.
+
+        :param observations: the model's observation space
+        :param actions: the model's action space
+        :raises ConfigError: if they differ
         """
         try:
             with quiet():
@@ -105,9 +195,164 @@ class Saved:
                 "was trained in, and a run's folder where it wraps or stacks observations"
             ) from error
 
+    @property
+    def environment(self) -> str:
+        """The environment's id, which is registered now.
+
+        :raises ConfigError: if the environment is not known, or not registered
+        """
+        if self.env_id is None:
+            raise ConfigError(
+                f"{self.path} does not say what it was trained in; give --env, e.g. --env "
+                "CartPole-v1"
+            )
+        import_packages(self.gym_packages)
+        known_environment(self.env_id)
+        return self.env_id
+
+    @property
+    def acts_deterministically(self) -> bool:
+        """Whether rl-zoo evaluates such a model deterministically: all but Atari games."""
+        return not is_atari(self.environment)
+
+    def envs(
+        self,
+        n_envs: int,
+        seed: int,
+        *,
+        training: bool = False,
+        wrappers: Sequence[Mapping[str, Any]] = (),
+        env_kwargs: Mapping[str, Any] | None = None,
+    ) -> VecEnv:
+        """Environments with the wrappers, stacking and normalisation of the model's training.
+
+        :param n_envs: how many side by side, in this process
+        :param training: whether rewards are normalised and statistics updated
+        :param wrappers: further ones, around those of the run but below stacking and
+            normalisation; each a path to its arguments, as in rl-zoo's ``env_wrapper``
+        :param env_kwargs: arguments of the environment beside those of the run
+        :raises ConfigError: if the environment is not known or registered, or cannot be made
+        :raises CorruptStateError: if a file that belongs to the model is damaged
+        """
+        env_id = self.environment
+        settings = dict(self.settings)
+        kwargs = dict(settings.pop("env_kwargs", {}))
+        where = ""
+        if self.parameters is not None:
+            kwargs |= RunFolder(self.parameters.parent).arguments().get("env_kwargs") or {}
+            where = f" with the wrappers and arguments in {self.parameters}"
+        kwargs |= env_kwargs or {}
+        if wrappers:
+            own = settings.get("env_wrapper") or []
+            settings["env_wrapper"] = [*(own if isinstance(own, list) else [own]), *wrappers]
+        failure = f"{env_id} cannot be made{where}"
+        with setup_errors(failure, env_id), quiet(), mujoco_warns_once(env_id):
+            check_wrappers(settings)
+            envs: VecEnv = create_test_env(
+                env_id,
+                n_envs=n_envs,
+                seed=seed,
+                should_render=False,
+                hyperparams=settings,
+                env_kwargs=kwargs,
+                vec_env_cls=DummyVecEnv,
+            )
+        try:
+            if self.vecnormalize is not None:
+                envs = load_statistics(self.vecnormalize, envs)
+                envs.training = training
+                envs.norm_reward = training and envs.norm_reward
+            if settings.get("frame_stack"):
+                with setup_errors(f"frames of {env_id} cannot be stacked", env_id):
+                    envs = VecFrameStack(envs, settings["frame_stack"])
+        except SparsityError:
+            envs.close()
+            raise
+        return envs
+
+    def training_envs(self, n_envs: int | None, seed: int) -> VecEnv:
+        """Environments to train on in.
+
+        :param n_envs: None: as many as it was trained in
+        :raises ConfigError: as :meth:`envs`
+        :raises CorruptStateError: as :meth:`envs`
+        """
+        if n_envs is None:
+            n_envs = look_into(self.path).data.get("n_envs")
+        if not 0 <= seed < 2**31:
+            raise ConfigError(f"the seed must lie in [0, 2^31), got {seed}")
+        if n_envs is None or not is_whole(n_envs) or n_envs < 1:
+            raise ConfigError(f"n_envs must be 1 or more, got {n_envs!r}; give --n-envs")
+        return self.envs(n_envs, seed, training=True)
+
+    def evaluation_envs(self, episodes: int, seed: int) -> VecEnv:
+        """Environments with true rewards, and statistics that stay as they are.
+
+        :param episodes: of one evaluation
+        :raises ConfigError: as :meth:`envs`
+        :raises CorruptStateError: as :meth:`envs`
+        """
+        # Atari's episodes end with each life, in the middle of a game that several would not leave.
+        atari = is_atari(self.environment)
+        return self.envs(1 if atari else max(1, min(EVALUATION_ENVS, episodes)), seed)
+
+    def write_run_files(self, folder: Path) -> None:
+        """Write the files by which rl-zoo and ``sb3-sparse enjoy`` know a run.
+
+        :param folder: the run's own; its model will be ``<env>.zip``
+        """
+        env_id = self.environment
+        parameters = RunFolder(folder).parameters(env_id)
+        parameters.mkdir(parents=True, exist_ok=True)
+        arguments: dict[str, Any] = {"env_kwargs": None, "seed": 0}
+        normalized = self.vecnormalize is not None
+        settings = yaml.dump({"normalize": normalized})
+        if self.parameters is not None:
+            known = RunFolder(self.parameters.parent).arguments()
+            arguments = {key: one for key, one in known.items() if not isinstance(one, NotBuilt)}
+            if self.settings:
+                settings = read_text(self.parameters / CONFIG, "YAML file of a run", RESTORE)
+                if self.settings["normalize"] != normalized:  # statistics were given for it
+                    settings = yaml.dump({**self.settings, "normalize": normalized})
+        arguments |= {"algo": self.algo, "env": env_id, "gym_packages": list(self.gym_packages)}
+        (parameters / ARGUMENTS).write_text(yaml.dump(arguments), encoding="utf-8")
+        (parameters / CONFIG).write_text(settings, encoding="utf-8")
+
+
+def locate(path: Path, best: bool = False) -> tuple[Path, RunFolder]:
+    """The zip of a model, and the folder that it lies in, which may be a run's.
+
+    :param path: a run's folder, or a zip, whose suffix may be left out
+    :param best: of a folder, the best policy instead of the last
+    :raises ConfigError: if a folder holds no run or no such model
+    """
+    if not RunFolder(path).is_run:  # a run may have a folder of its zip's name
+        path = zip_path(path)
+    if not path.is_dir():
+        return path, RunFolder(path.parent)
+    folder = RunFolder(path)
+    return folder.model(folder.arguments()["env"], best), folder
+
+
+def check_wrappers(settings: Mapping[str, Any]) -> None:
+    """Reject what is no wrapper: calling whatever a file names would run anything.
+
+    :raises ConfigError: if so
+    """
+    for name, kind in (("env_wrapper", gym.Wrapper), ("vec_env_wrapper", VecEnvWrapper)):
+        given = settings.get(name) or []
+        for one in given if isinstance(given, list) else [given]:
+            path = one if isinstance(one, str) else next(iter(one))
+            found = import_path(path)
+            if not (isinstance(found, type) and issubclass(found, kind)):
+                raise ConfigError(
+                    f"{name} {path} is no subclass of {kind.__module__}.{kind.__name__}; make it "
+                    "one"
+                )
+
 
 def check_attributes(path: Path, algo: str, data: Mapping[str, Any]) -> None:
-    """Refuse a model with a setting that it cannot train on with.
+    """Reject a model with a setting that it cannot train on with.
 
     :param path: of its zip
     :param algo: algorithm, e.g. ``"sac"``
@@ -130,75 +375,37 @@ def check_attributes(path: Path, algo: str, data: Mapping[str, Any]) -> None:
         )
 
 
-def find_saved(
-    path: Path,
-    *,
-    best: bool = False,
-    algo: str | None = None,
-    env_id: str | None = None,
-    vecnormalize: Path | None = None,
-    gym_packages: Sequence[str] = (),
-) -> Saved:
-    """Find a model and all that belongs to it.
+def check_start(start: Path, run: RunSpec) -> None:
+    """Reject a model or statistics that training cannot resume from.
 
-    :param path: a run's folder, of ``sb3-sparse train`` or of ``rl_zoo3.train``, or a zip of SB3,
-        in such a folder or not
-    :param best: of a folder, the best policy instead of the last
-    :param algo: None: as the run's folder or the file says
-    :param env_id: None: as the run's folder says
-    :param vecnormalize: statistics of a VecNormalize; None: those in the run's folder
-    :param gym_packages: modules that register environments or algorithms, beside those that the run
-        names
-    :raises ConfigError: if there is no model, or what belongs to it is missing
-    :raises CorruptStateError: if one of the files is damaged
+    :param start: folder of a checkpoint, or of the run
+    :param run: what is trained
+    :raises ConfigError: if there is no model
+    :raises CorruptStateError: if one of the two files is damaged
+    :raises Diverged: if one of them is not finite
     """
-    if not is_run(path):
-        path = zip_path(path)
-    folder = path if path.is_dir() else path.parent
-    arguments = arguments_of(folder) if path.is_dir() or is_run(folder) else {}
-    env_id, packages = environment_in({**arguments, "env": env_id or arguments.get("env")})
-    packages = package_names([*packages, *gym_packages])
-    wanted = algo or arguments.get("algo")
-    if wanted is not None and wanted not in loadable_algorithms():
-        import_packages(packages)
-    params = params_of(folder, arguments["env"]) if arguments else None
-    if path.is_dir():
-        path = model_in(folder, arguments["env"], best)
-    if params is not None and arguments["algo"] not in loadable_algorithms():
-        raise CorruptStateError(
-            f"{params / ARGUMENTS} is damaged: algo is {arguments['algo']!r}; known are "
-            f"{', '.join(loadable_algorithms())}"
-        )
-    algo = _algo(path, algo, arguments.get("algo"))
-    settings: Mapping[str, Any] = {}
-    if params is not None and (vecnormalize is None or (params / CONFIG).is_file()):
-        settings = environment_settings(params)
-    if vecnormalize is None:
-        vecnormalize = _statistics_of_run(params, settings) if params else None
-    if vecnormalize is None and params is None:
-        _check_lone(path, algo)
-    if vecnormalize is not None and not vecnormalize.is_file():
-        raise ConfigError(
-            f"there is no file {vecnormalize}; give what VecNormalize.save wrote, e.g. "
-            f"{VECNORMALIZE}"
-        )
-    return Saved(path, algo, env_id, params, vecnormalize, settings, packages)
+    parameters = RunFolder(start).parameters(run.env_id)
+    saved = SavedModel(parameters.with_name(f"{parameters.name}.zip"), run.algo)
+    saved.load()
+    check_attributes(saved.path, run.algo, read_model(saved.path)[0])
+    if (parameters / VECNORMALIZE).is_file():
+        read_statistics(parameters / VECNORMALIZE)
 
 
-def _statistics_of_run(params: Path, settings: Mapping[str, Any]) -> Path | None:
+def _statistics_of_run(parameters: Path, settings: Mapping[str, Any]) -> Path | None:
     """The statistics in a run's folder; None if it was not normalised.
 
     :raises ConfigError: if they are not there though it was, or there though it was not
     """
-    path = params / VECNORMALIZE
+    path = parameters / VECNORMALIZE
     if settings["normalize"] and not path.is_file():
         raise ConfigError(
-            f"the run in {params.parent} normalised its observations, but {path} is missing; "
+            f"the run in {parameters.parent} normalised its observations, but {path} is missing; "
             "give the statistics with --vecnormalize FILE"
         )
     if path.is_file() and not settings["normalize"]:
         raise ConfigError(
-            f"{path} is there, though {params / CONFIG} says that nothing was normalised; give "
+            f"{path} is there, though {parameters / CONFIG} says that nothing was normalised; give "
             f"--vecnormalize {path} to use it, or remove it"
         )
     return path if settings["normalize"] else None

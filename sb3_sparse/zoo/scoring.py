@@ -17,9 +17,8 @@ from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecVideoRecorder
 
 from sb3_sparse.errors import ConfigError, MissingExtra
-from sb3_sparse.zoo.finetune import environment_of, envs_of, evaluated_deterministically
 from sb3_sparse.zoo.manager import quiet
-from sb3_sparse.zoo.saved import Saved, find_saved
+from sb3_sparse.zoo.saved import SavedModel
 from sb3_sparse.zoo.watch import counting
 
 VIDEO_STEPS = 1000
@@ -75,7 +74,7 @@ def enjoy(
     """
     if episodes < 1:
         raise ConfigError(f"episodes must be 1 or more, got {episodes}")
-    saved = find_saved(
+    saved = SavedModel.find(
         path,
         best=best,
         algo=algo,
@@ -83,7 +82,7 @@ def enjoy(
         vecnormalize=vecnormalize,
         gym_packages=gym_packages,
     )
-    environment_of(saved)
+    saved.environment  # noqa: B018  # rejected before anything is made
     if video and importlib.util.find_spec("moviepy") is None:
         raise MissingExtra("recording a video", "video")
     if video and sys.platform == "linux" and not os.environ.get("DISPLAY"):
@@ -91,7 +90,7 @@ def enjoy(
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # lets pygame draw without one
     set_random_seed(seed)
     kwargs: dict[str, Any] = {"render_mode": "rgb_array"} if video else {}
-    env = envs_of(saved, 1, seed, env_kwargs=kwargs)
+    env = saved.envs(1, seed, env_kwargs=kwargs)
     folder = saved.path.parent / "videos"
     try:
         model = saved.load()
@@ -105,13 +104,12 @@ def enjoy(
                     video_length=VIDEO_STEPS,
                     name_prefix=saved.path.stem,
                 )
-            deterministic = evaluated_deterministically(saved)
             on_episode(0)
             mean, std = evaluate_policy(
                 model,
                 env,
                 n_eval_episodes=episodes,
-                deterministic=deterministic,
+                deterministic=saved.acts_deterministically,
                 callback=counting(on_episode),
             )
             on_episode(episodes)
@@ -125,7 +123,7 @@ def enjoy(
 
 
 @contextmanager
-def _filmed(saved: Saved, video: bool) -> Iterator[None]:
+def _filmed(saved: SavedModel, video: bool) -> Iterator[None]:
     """Turn errors while a video is made into errors about the video.
 
     MoviePy's own progress bar, which always goes to stderr, is dropped.

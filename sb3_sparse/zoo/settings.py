@@ -1,9 +1,13 @@
-"""The settings of a run: a config's entry with what the user wants otherwise."""
+"""The settings of a run: a config's entry with what the user changes in it."""
 
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterable, Mapping
+import dataclasses
+import inspect
+import json
+from collections.abc import Iterable, Iterator, Mapping
+from copy import deepcopy
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -17,15 +21,264 @@ if TYPE_CHECKING:  # which is imported when settings are checked, not when names
 POLICY = "sb3_sparse.SparsePolicy"
 ALIAS = "SparsePolicy"
 CALLBACK = "sb3_sparse.SparsityCallback"
-# What rl-zoo reads itself, beside the arguments of the algorithm's constructor.
+DENSE = "dense"
 ZOO_KEYS = frozenset(
-    ("callback", "env_kwargs", "env_wrapper", "frame_stack", "monitor_kwargs", "n_envs")
-    + ("n_timesteps", "noise_std", "noise_type", "normalize", "policy", "policy_kwargs")
-    + ("vec_env_wrapper",)
+    {
+        "callback",
+        "env_kwargs",
+        "env_wrapper",
+        "frame_stack",
+        "monitor_kwargs",
+        "n_envs",
+        "n_timesteps",
+        "noise_std",
+        "noise_type",
+        "normalize",
+        "policy",
+        "policy_kwargs",
+        "vec_env_wrapper",
+    }
 )
+"""What rl-zoo reads itself, beside the arguments of the algorithm's constructor."""
+SET_BY_THE_RUN = frozenset({"device", "seed", "tensorboard_log", "verbose"})
+"""Arguments of every algorithm that options of their own set."""
+COMPARED = frozenset({"sparsity", "initial_sparsity", "method", "callback", "policy_kwargs"})
+"""What :meth:`Settings.variant` leaves out, or lists apart."""
 
-# Arguments of every algorithm that a run sets itself, by options of their own.
-SET_BY_THE_ENGINE = frozenset({"device", "seed", "tensorboard_log", "verbose"})
+
+class Settings(Mapping[str, Any]):
+    """The settings of a run, as a config's entry has them. They cannot be changed.
+
+    A mapping of rl-zoo's names: the algorithm's arguments, ``policy_kwargs``, ``callback``,
+    ``n_timesteps`` and so on. ``policy_kwargs`` is always a mapping.
+
+    Example::
+
+        from sb3_sparse.zoo import RunSpec
+
+        settings = RunSpec(algo="sac", env_id="Pendulum-v1", sparsity=0.9).settings()
+        print(settings.method, settings.policy_kwargs["sparsity"], settings["n_timesteps"])
+
+    :param content: the mapping; it is copied
+    :param imports: whether dotted paths may be imported to tell what they are. False for settings
+        from a stranger's file: then a callback with a ``method`` counts as a SparsityCallback
+    :raises ConfigError: if ``policy_kwargs`` or the callback has another form
+    """
+
+    def __init__(self, content: Mapping[str, Any], *, imports: bool = True) -> None:
+        self._content = deepcopy(dict(content))
+        self._content["policy_kwargs"] = _policy_kwargs(self._content)
+        self._imports = imports
+
+    def __getitem__(self, name: str) -> Any:
+        return self._content[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._content)
+
+    def __len__(self) -> int:
+        return len(self._content)
+
+    def __repr__(self) -> str:
+        return f"Settings({self._content!r})"
+
+    def as_dict(self) -> dict[str, Any]:
+        """A copy that may be changed."""
+        return deepcopy(self._content)
+
+    @property
+    def policy_kwargs(self) -> dict[str, Any]:
+        """The policy's arguments; a copy."""
+        return deepcopy(self._content["policy_kwargs"])
+
+    @property
+    def callback(self) -> Mapping[str, Any] | None:
+        """The arguments of the SparsityCallback; None if there is none.
+
+        :raises ConfigError: if a callback has another form, or lacks its method
+        """
+        found = _sparsity_callback(self._content, self._imports)
+        return None if found is None else found[1]
+
+    @property
+    def has_own_callback(self) -> bool:
+        """Whether a subclass of SparsityCallback, which may take other arguments, is used."""
+        found = _sparsity_callback(self._content, self._imports)
+        return found is not None and found[0]
+
+    @property
+    def method(self) -> str:
+        """The topology method; ``"static"`` without a callback, ``"dense"`` at sparsity 0.
+
+        :raises ConfigError: if the policy is not a sparse one
+        """
+        policy = self.get("policy")
+        if policy not in (POLICY, ALIAS):
+            raise ConfigError(
+                f"the policy must be {POLICY} (with sparsity 0.0 for dense training), got "
+                f"{policy!r}"
+            )
+        if self.callback is not None:
+            return method_named(self.callback["method"]).name
+        sparsity = self["policy_kwargs"].get("sparsity")
+        shares = list(sparsity.values()) if isinstance(sparsity, Mapping) else [sparsity]
+        return DENSE if all(share == 0.0 for share in shares) else "static"
+
+    def changed(self, overrides: Mapping[str, Any], algorithm: type[BaseAlgorithm]) -> Settings:
+        """These settings with each override where it belongs: callback, policy or algorithm.
+
+        The names do not overlap, so ``update_interval``, ``weight_decay`` and ``learning_rate``
+        each find their own place. A mapping given for a mapping is merged into it.
+
+        :param overrides: values by name
+        :param algorithm: whose settings these are
+        :raises ConfigError: for a name that none of them has
+        """
+        names, content = Names.of(algorithm), self.as_dict()
+        for name, value in overrides.items():
+            if name in names.algorithm:
+                known = content.get(name)
+                both = isinstance(known, Mapping) and isinstance(value, Mapping)
+                content[name] = {**known, **value} if both and known else value
+            elif name in names.policy:
+                content["policy_kwargs"] = {**_policy_kwargs(content), name: value}
+            elif name in names.schedule:
+                found = _sparsity_callback(content, self._imports)
+                if found is None:
+                    raise ConfigError(
+                        f"{name} means nothing here: these settings train without {CALLBACK}"
+                    )
+                found[1][name] = value
+            else:
+                raise ConfigError(
+                    f"{algorithm.__name__} has no hyperparameter {name!r}"
+                    f"{did_you_mean(name, names.all)}. Of the algorithm: "
+                    f"{_listed(names.algorithm)}. Of the policy: {_listed(names.policy)}. Of the "
+                    f"mask's schedule: {_listed(names.schedule)}"
+                )
+        return Settings(content, imports=self._imports)
+
+    def replaced(self, **content: Any) -> Settings:
+        """These settings with other values of rl-zoo's names."""
+        return Settings({**self._content, **content}, imports=self._imports)
+
+    def value(self, name: str, algorithm: type[BaseAlgorithm] | None = None) -> Any:
+        """A setting, wherever it lies: of the policy, the callback or the algorithm.
+
+        :param algorithm: whose default counts where the settings lack the name
+        :return: ``"default"`` where the default depends on the method
+        """
+        for place in (self["policy_kwargs"], self.callback or {}, self):
+            if name in place:
+                return place[name]
+        if name == "weight_decay":
+            return 0.0
+        from sb3_sparse.policies.config import SparsityConfig
+
+        for one in dataclasses.fields(SparsityConfig):
+            if one.name == name and one.default is not dataclasses.MISSING:
+                return one.default
+        if algorithm is not None:
+            parameter = inspect.signature(algorithm).parameters.get(name)
+            if parameter is not None and parameter.default is not parameter.empty:
+                return parameter.default
+        return "default"
+
+    def variant(self, without: Iterable[str] = ()) -> str:
+        """All settings but method and sparsity, as one comparable text.
+
+        :param without: further names to leave out
+        """
+        hidden = {*COMPARED, *without}
+        parts = {"policy_kwargs": self["policy_kwargs"], "callback": self.callback or {}}
+        kept = {
+            part: {name: value for name, value in values.items() if name not in hidden}
+            for part, values in {"": self, **parts}.items()
+        }
+        return json.dumps({**kept.pop(""), **kept}, sort_keys=True, default=str)
+
+
+@dataclass(frozen=True)
+class Names:
+    """The arguments that settings may hold, by whose they are. They do not overlap.
+
+    :param algorithm: of the algorithm's constructor and of rl-zoo
+    :param policy: of the sparse policy
+    :param schedule: of the SparsityCallback, but for its method
+    """
+
+    algorithm: frozenset[str]
+    policy: frozenset[str]
+    schedule: frozenset[str]
+
+    @classmethod
+    def of(cls, algorithm: type[BaseAlgorithm]) -> Names:
+        """Those that go with an algorithm."""
+        from sb3_sparse.callback import SparsityCallback
+
+        return cls(
+            (arguments_of(algorithm) - SET_BY_THE_RUN) | ZOO_KEYS,
+            arguments_of(algorithm.policy_aliases[ALIAS]),
+            arguments_of(SparsityCallback) - {"method", "verbose"},
+        )
+
+    @property
+    def all(self) -> frozenset[str]:
+        """All of them."""
+        return self.algorithm | self.policy | self.schedule
+
+
+def _listed(names: Iterable[str]) -> str:
+    return ", ".join(sorted(names))
+
+
+def _sparsity_callback(
+    settings: Mapping[str, Any], imports: bool
+) -> tuple[bool, dict[str, Any]] | None:
+    """Whether the SparsityCallback is a subclass of the user's, and its arguments."""
+    callbacks = settings.get("callback") or []
+    for callback in callbacks if isinstance(callbacks, list) else [callbacks]:
+        named = callback if isinstance(callback, dict) else {callback: {}}
+        if len(named) != 1:
+            raise ConfigError(
+                f"a callback is one path, with its arguments indented below it, got {callback!r}"
+            )
+        ((path, arguments),) = named.items()
+        has_method = isinstance(arguments, dict) and "method" in arguments
+        own = _is_own(path) if imports or path == CALLBACK else has_method or None
+        if own is not None:
+            if not has_method:
+                raise ConfigError(f"{path} needs a method, e.g. {path}: {{method: rigl}}")
+            return own, arguments
+    return None
+
+
+def _is_own(path: object) -> bool | None:
+    """Whether a path names a subclass of SparsityCallback; None: neither that nor itself."""
+    if not isinstance(path, str):
+        raise ConfigError(f"a callback is a dotted path, e.g. {CALLBACK}, got {path!r}")
+    if path == CALLBACK:
+        return False
+    from sb3_sparse.callback import SparsityCallback
+
+    try:
+        found = import_path(path)
+    except ImportError:
+        return None  # rl-zoo says so when it imports it
+    ours = isinstance(found, type) and issubclass(found, SparsityCallback)
+    return found is not SparsityCallback if ours else None
+
+
+def _policy_kwargs(settings: Mapping[str, Any]) -> dict[str, Any]:
+    kwargs = settings.get("policy_kwargs", {})
+    if isinstance(kwargs, str):
+        kwargs = _value(kwargs)
+    if not isinstance(kwargs, dict):
+        raise ConfigError(
+            f"policy_kwargs must be a mapping of plain values, got {kwargs!r}; e.g. "
+            "{sparsity: 0.9, net_arch: [256, 256], activation_fn: torch.nn.ReLU}"
+        )
+    return kwargs
 
 
 def parse_overrides(texts: Iterable[str]) -> dict[str, Any]:
@@ -63,154 +316,3 @@ def _value(text: str) -> Any:
         return ast.literal_eval(_DictCalls().visit(ast.parse(text.strip(), mode="eval")))
     except (ValueError, SyntaxError):
         return text
-
-
-@dataclass(frozen=True)
-class Names:
-    """The arguments that settings may hold, by whose they are. They do not overlap.
-
-    :param algorithm: of the algorithm's constructor and of rl-zoo
-    :param policy: of the sparse policy
-    :param schedule: of the SparsityCallback, but for its method
-    """
-
-    algorithm: frozenset[str]
-    policy: frozenset[str]
-    schedule: frozenset[str]
-
-    @classmethod
-    def of(cls, algorithm: type[BaseAlgorithm]) -> Names:
-        """Those that go with an algorithm."""
-        from sb3_sparse.callback import SparsityCallback
-
-        return cls(
-            (arguments_of(algorithm) - SET_BY_THE_ENGINE) | ZOO_KEYS,
-            arguments_of(algorithm.policy_aliases[ALIAS]),
-            arguments_of(SparsityCallback) - {"method", "verbose"},
-        )
-
-
-def apply_overrides(
-    settings: dict[str, Any], overrides: Mapping[str, Any], algorithm: type[BaseAlgorithm]
-) -> None:
-    """Put each override where it belongs: callback, policy or algorithm; in place.
-
-    The names do not overlap, so ``update_interval``, ``weight_decay`` and ``learning_rate`` each
-    find their own place. A mapping given for a mapping (``policy_kwargs``) is merged into it.
-
-    :raises ConfigError: for a name that none of them has
-    """
-    names = Names.of(algorithm)
-    for name, value in overrides.items():
-        if name in names.algorithm:
-            known = settings.get(name)
-            both = isinstance(known, Mapping) and isinstance(value, Mapping)
-            settings[name] = {**known, **value} if both and known else value
-        elif name in names.policy:
-            settings["policy_kwargs"] = {**policy_kwargs_of(settings), name: value}
-        elif name in names.schedule:
-            sparsity_callback(settings, name)[name] = value
-        else:
-            known_names = names.algorithm | names.policy | names.schedule
-            raise ConfigError(
-                f"{algorithm.__name__} has no hyperparameter {name!r}"
-                f"{did_you_mean(name, known_names)}. Of the algorithm: "
-                f"{_listed(names.algorithm)}. Of the policy: {_listed(names.policy)}. Of the "
-                f"mask's schedule: {_listed(names.schedule)}"
-            )
-
-
-def _listed(names: Iterable[str]) -> str:
-    return ", ".join(sorted(names))
-
-
-def sparsity_callback(settings: Mapping[str, Any], wanted: str = "") -> dict[str, Any]:
-    """The arguments of the SparsityCallback in the settings, to read or to change.
-
-    :param wanted: what is to be set, for the message
-    :raises ConfigError: if there is no such callback
-    """
-    arguments = find_callback(settings)
-    if arguments is None:
-        raise ConfigError(f"{wanted} means nothing here: these settings train without {CALLBACK}")
-    return arguments
-
-
-def find_callback(settings: Mapping[str, Any]) -> dict[str, Any] | None:
-    """The arguments of the SparsityCallback in the settings; None where there is none."""
-    found = _our_callback(settings)
-    return None if found is None else found[1]
-
-
-def has_own_callback(settings: Mapping[str, Any]) -> bool:
-    """Whether the callback is a subclass of the user's, which may take other arguments."""
-    found = _our_callback(settings)
-    return found is not None and found[0]
-
-
-def _our_callback(settings: Mapping[str, Any]) -> tuple[bool, dict[str, Any]] | None:
-    """Whether the callback is a subclass of the user's, and its arguments."""
-    callbacks = settings.get("callback") or []
-    for callback in callbacks if isinstance(callbacks, list) else [callbacks]:
-        named = callback if isinstance(callback, dict) else {callback: {}}
-        if len(named) != 1:
-            raise ConfigError(
-                f"a callback is one path, with its arguments indented below it, got {callback!r}"
-            )
-        ((path, arguments),) = named.items()
-        own = _is_own(path)
-        if own is not None:
-            if not isinstance(arguments, dict) or "method" not in arguments:
-                raise ConfigError(f"{path} needs a method, e.g. {path}: {{method: rigl}}")
-            return own, arguments
-    return None
-
-
-def _is_own(path: object) -> bool | None:
-    """Whether a path names a subclass of SparsityCallback; None: neither that nor itself."""
-    if not isinstance(path, str):
-        raise ConfigError(f"a callback is a dotted path, e.g. {CALLBACK}, got {path!r}")
-    if path == CALLBACK:
-        return False
-    from sb3_sparse.callback import SparsityCallback
-
-    try:
-        found = import_path(path)
-    except ImportError:
-        return None  # rl-zoo says so when it imports it
-    ours = isinstance(found, type) and issubclass(found, SparsityCallback)
-    return found is not SparsityCallback if ours else None
-
-
-def method_of(settings: Mapping[str, Any]) -> str:
-    """The method that the settings train with.
-
-    :raises ConfigError: if their policy is not sparse, or they say contradictory things
-    """
-    policy = settings.get("policy")
-    if policy not in (POLICY, ALIAS):
-        raise ConfigError(
-            f"the policy must be {POLICY} (with sparsity 0.0 for dense training), got {policy!r}"
-        )
-    callback = find_callback(settings)
-    if callback is not None:
-        return method_named(callback["method"]).name
-    sparsity = policy_kwargs_of(settings).get("sparsity")
-    shares = list(sparsity.values()) if isinstance(sparsity, Mapping) else [sparsity]
-    return "dense" if all(share == 0.0 for share in shares) else "static"
-
-
-def policy_kwargs_of(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """The policy's arguments in the settings.
-
-    :raises ConfigError: if they are no mapping
-    """
-    kwargs = settings.get("policy_kwargs", {})
-    if isinstance(kwargs, str):
-        kwargs = _value(kwargs)
-    if not isinstance(kwargs, dict):
-        raise ConfigError(
-            f"policy_kwargs must be a mapping of plain values, got {kwargs!r}; e.g. "
-            "{sparsity: 0.9, net_arch: [256, 256], activation_fn: torch.nn.ReLU}"
-        )
-    return kwargs

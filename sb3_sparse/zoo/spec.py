@@ -14,7 +14,8 @@ from sb3_sparse.algorithms.table import algorithm_named
 from sb3_sparse.errors import ConfigError, did_you_mean
 from sb3_sparse.policies.registry import algorithm_names
 from sb3_sparse.sparsity.distributions import check_distribution, check_sparsity
-from sb3_sparse.zoo.arguments import MAPPING, Kind, is_whole
+from sb3_sparse.sparsity.numeric import is_whole
+from sb3_sparse.zoo.arguments import MAPPING, Kind
 from sb3_sparse.zoo.configs import config_path, entry_of, evaluation_of
 from sb3_sparse.zoo.environments import (
     import_packages,
@@ -23,12 +24,11 @@ from sb3_sparse.zoo.environments import (
     package_names,
     plain_id,
 )
-from sb3_sparse.zoo.settings import apply_overrides, method_of, policy_kwargs_of
+from sb3_sparse.zoo.settings import DENSE, Settings
 
 if TYPE_CHECKING:  # which is imported when settings are checked, not when a run is named
     from stable_baselines3.common.base_class import BaseAlgorithm
 
-DENSE = "dense"
 _TEXT = Kind("a text", lambda v: isinstance(v, str))
 _WHOLE = Kind("a whole number, e.g. 100000", is_whole)
 COUNTS = ("n_timesteps", "n_envs", "eval_freq", "eval_episodes")
@@ -42,7 +42,14 @@ OPTIONAL = frozenset({"method", "conf_file", "entry", *COUNTS})
 
 @dataclass(frozen=True)
 class RunSpec:
-    """One training run. What is None is as the config says.
+    """What to train. None leaves a value to the config.
+
+    Example::
+
+        from sb3_sparse.zoo import RunSpec
+
+        run = RunSpec(algo="sac", env_id="Pendulum-v1", method="rigl", sparsity=0.9, seed=1)
+        print(run.settings()["policy_kwargs"])
 
     :param algo: algorithm, e.g. ``"sac"``
     :param env_id: Gymnasium id; ``"package:Id-v0"`` becomes ``"Id-v0"`` and one more package
@@ -53,16 +60,16 @@ class RunSpec:
     :param n_timesteps: environment steps
     :param n_envs: environments side by side
     :param device: as in SB3
-    :param hyperparams: what else shall differ from the config, by name; of the algorithm, the
-        policy, the mask's schedule or rl-zoo
-    :param conf_file: a YAML file of one's own in rl-zoo's form, or the name of another shipped one,
-        e.g. ``"dqn_impala"``; None: the shipped one of the method and the algorithm
-    :param match_params: train the dense network that has as many parameters as this sparsity leaves
+    :param hyperparams: further values that replace the config's, by name: arguments of the
+        algorithm, the policy, the SparsityCallback or rl-zoo
+    :param conf_file: your own YAML file in rl-zoo's form, or the name of another shipped one, e.g.
+        ``"dqn_impala"``; None: the shipped file of the method and the algorithm
+    :param match_params: train a dense network with as many parameters as this sparsity leaves
     :param eval_freq: environment steps between two evaluations
     :param eval_episodes: episodes of one evaluation
-    :param entry: settings in place of those that the config has for the environment
-    :param gym_packages: modules that register environments or algorithms when they are imported,
-        as rl-zoo's ``--gym-packages``
+    :param entry: settings to use instead of the config's entry for the environment
+    :param gym_packages: modules to import, which register environments or algorithms; rl-zoo's
+        ``--gym-packages``
     :raises ConfigError: for a name or value that is not allowed
     """
 
@@ -137,7 +144,7 @@ class RunSpec:
         return config_path(self.method or "rigl", self.conf_file or self.algo)
 
     def config_entry(self) -> dict[str, Any]:
-        """What the config has for the environment; a copy of one's own.
+        """The config's entry for the environment; a copy.
 
         :raises ConfigError: if it has nothing
         """
@@ -145,14 +152,13 @@ class RunSpec:
             return deepcopy(dict(self.entry))
         return entry_of(self.config, self.env_id, is_atari(self.env_id))
 
-    def settings(self) -> dict[str, Any]:
-        """The config's entry, with everything that this run wants otherwise.
+    def settings(self) -> Settings:
+        """The config's entry, with everything that this run changes in it.
 
         :raises ConfigError: if the config has none, or if it and the run contradict each other
         """
-        settings = self.config_entry()
-        settings["policy_kwargs"] = policy_kwargs_of(settings)
-        method = method_of(settings)
+        settings = Settings(self.config_entry())
+        method = settings.method
         if self.method not in (None, method):
             raise ConfigError(
                 f"{self.config} trains with method {method!r}, not {self.method!r}; leave --method "
@@ -175,20 +181,19 @@ class RunSpec:
             for name in ("sparsity", "distribution", "n_timesteps", "n_envs")
             if getattr(self, name) is not None
         }
-        apply_overrides(settings, {**self.hyperparams, **wanted}, self.algorithm)
+        settings = settings.changed({**self.hyperparams, **wanted}, self.algorithm)
         check_settings(settings, self.algorithm)
-        if method_of(settings) != method:
+        if settings.method != method:
             raise ConfigError(
-                f"what is changed makes this {method_of(settings)!r} training, not {method!r}; "
-                f"choose it with --method {method_of(settings)}"
+                f"what is changed makes this {settings.method!r} training, not {method!r}; "
+                f"choose it with --method {settings.method}"
             )
         if "n_timesteps" not in settings:
             raise ConfigError(
                 f"the settings of {self.env_id} in {self.config} lack n_timesteps; add it there or "
                 "give -n"
             )
-        settings["n_timesteps"] = int(settings["n_timesteps"])
-        return settings
+        return settings.replaced(n_timesteps=int(settings["n_timesteps"]))
 
     def evaluation(self) -> dict[str, int]:
         """``eval_freq`` and ``eval_episodes``."""
@@ -197,7 +202,7 @@ class RunSpec:
         return {name: given[name] or value for name, value in schedule.items()}
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values, from which ``RunSpec(**values)`` makes the same run."""
+        """Plain values from which ``RunSpec(**values)`` makes an equal one."""
         values = {**asdict(self), "hyperparams": dict(self.hyperparams)}
         packages = values.pop("gym_packages")  # named only where there are any, as in old files
         return {**values, "gym_packages": list(packages)} if packages else values

@@ -8,35 +8,29 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_sparse.errors import ConfigError, command
+from sb3_sparse.errors import ConfigError, CorruptStateError, command
 from sb3_sparse.policies.base import BaseSparsePolicy
 from sb3_sparse.policies.compiled import unwrapped
-from sb3_sparse.zoo.checkpoint import (
-    Checkpoints,
-    StopTraining,
-    clear_checkpoints,
-    last_checkpoint,
-    locked,
-    restored_monitors,
-)
-from sb3_sparse.zoo.computing import computing_at
+from sb3_sparse.zoo.checkpoint import Checkpoints, StopTraining, restored_monitors
+from sb3_sparse.zoo.computing import computing_at, counts_of
 from sb3_sparse.zoo.disk import writing
 from sb3_sparse.zoo.divergence import check_networks
 from sb3_sparse.zoo.ending import diverging, recorded
 from sb3_sparse.zoo.evaluation import Evaluated, Evaluation
-from sb3_sparse.zoo.folder import new_run_folder
+from sb3_sparse.zoo.folder import RunFolder
 from sb3_sparse.zoo.manager import RunManager, spaces_of
-from sb3_sparse.zoo.plan import check_start, planned
-from sb3_sparse.zoo.prepare import doubt, explained, prepare
-from sb3_sparse.zoo.record import DIVERGED, NAME, read_record, sparsity_of, write_record
+from sb3_sparse.zoo.prepare import prepare, settings_fail, setup_errors
+from sb3_sparse.zoo.record import CURE, Status
 from sb3_sparse.zoo.results import Outcome, final_results
+from sb3_sparse.zoo.saved import check_start
+from sb3_sparse.zoo.settings import Settings
 from sb3_sparse.zoo.spec import RunSpec
 from sb3_sparse.zoo.speed import denormals_as_zero, use_few_threads
+from sb3_sparse.zoo.validation import check_settings
 from sb3_sparse.zoo.watch import Watch
 
 EVALUATION_ENVS = 10
@@ -51,14 +45,23 @@ def train(
     folder: Path | None = None,
     watch: Watch | None = None,
 ) -> Outcome:
-    """Train anew in ``log_folder/<algo>/<env>_<number>``.
+    """Train a run in ``log_folder/<algo>/<env>_<number>``.
 
-    SIGINT and SIGTERM stop it at the end of the current rollout; :func:`resume` goes on.
+    SIGINT and SIGTERM stop it at the end of the current rollout; :func:`resume` continues it.
+
+    Example::
+
+        from pathlib import Path
+        from sb3_sparse.zoo import RunSpec, train
+
+        run = RunSpec(algo="dqn", env_id="CartPole-v1", n_timesteps=1000, eval_episodes=1)
+        outcome = train(run, Path("logs"))
+        print(outcome.folder, outcome.sparsity, outcome.results[0].mean_return)
 
     :param callbacks: further callbacks
-    :param tensorboard_log: where TensorBoard's files go; empty: none
+    :param tensorboard_log: folder of TensorBoard's files; empty: none
     :param after_evaluation: called after each evaluation; the evaluation is its ``parent``
-    :param folder: the run's own folder, ``.../<algo>/<name>``, in place of the next free number in
+    :param folder: the run's own folder, ``.../<algo>/<name>``, instead of the next free number in
         ``log_folder``; nothing else may be in it
     :param watch: is called as a callback, and told of what happens
     :raises ConfigError: if the environment cannot be made or the algorithm cannot act in it
@@ -69,46 +72,44 @@ def train(
     if tensorboard_log:
         tensorboard_log = str(Path(tensorboard_log).absolute())  # also after a resume elsewhere
     prepared = prepare(run, log_folder)
-    settings, evaluation = prepared.settings, prepared.evaluation
     use_few_threads(prepared.observation_space)
     with writing(folder or log_folder, "make it writable, or give another with --log-folder"):
         if folder is None:
-            folder = new_run_folder(log_folder / run.algo, run.env_id.replace("/", "-"))
+            own = RunFolder.new(log_folder, run.algo, run.env_id)
         else:
+            own = RunFolder(folder)
             folder.mkdir(parents=True, exist_ok=True)
-    with locked(folder):
-        if (folder / NAME).is_file():
+    with own.locked():
+        if own.has_record:
             raise ConfigError(
-                f"there is a run in {folder} already; go on with it by "
-                f"{command('train', '--resume', folder)}, or give another folder"
+                f"there is a run in {own} already; go on with it by "
+                f"{command('train', '--resume', own)}, or give another folder"
             )
-        write_record(
-            folder,
-            status="running",
-            **prepared.record(run),
-            tensorboard_log=tensorboard_log,
-        )
+        own.write(status=Status.RUNNING, **prepared.record(run), tensorboard_log=tensorboard_log)
         watch = watch or Watch()
-        watch.begins(folder, prepared.match)
+        watch.begins(own.path, prepared.match)
         model = None
         try:
-            with explained(doubt(run), run.env_id):
-                experiment = RunManager(run, settings, folder, evaluation, None, tensorboard_log)
-                model = experiment.setup()
-            with recorded(folder, experiment.env_name, model):
-                return _learn(
-                    run, experiment, model, folder, None, callbacks, watch, after_evaluation
+            with setup_errors(settings_fail(run), run.env_id):
+                manager = RunManager(
+                    run,
+                    prepared.settings,
+                    own,
+                    prepared.evaluation,
+                    tensorboard_log=tensorboard_log,
                 )
+                model = manager.setup()
+            return _Session(run, manager, model, callbacks, watch, after_evaluation).outcome()
         except Exception:
             if model is None or model.num_timesteps == 0:
-                shutil.rmtree(folder, ignore_errors=True)  # nothing was trained
+                shutil.rmtree(own.path, ignore_errors=True)  # nothing was trained
             raise
 
 
 def resume(
     folder: Path, callbacks: Sequence[BaseCallback] = (), watch: Watch | None = None
 ) -> Outcome:
-    """Go on with an interrupted run from its last checkpoint, or from the start if it has none.
+    """Continue an interrupted run from its last checkpoint, or from the start if it has none.
 
     :param folder: the run's folder
     :param callbacks: further callbacks
@@ -117,117 +118,148 @@ def resume(
         trains it
     :raises Diverged: if it diverges now
     """
-    read_record(folder)
-    with locked(folder):
-        record = read_record(folder)
-        if record["status"] == "finished":
-            clear_checkpoints(folder)
+    own = RunFolder(folder)
+    own.record()
+    with own.locked():
+        record = own.record()
+        if record.status is Status.FINISHED:
+            own.clear_checkpoints()
             raise ConfigError(
-                f"the run in {folder} is finished; look at it with {command('enjoy', folder)}, or "
+                f"the run in {own} is finished; look at it with {command('enjoy', own)}, or "
                 "train longer anew with -n"
             )
-        if record["status"] == DIVERGED:
-            raise ConfigError(f"the run in {folder} has ended: {record['error']}")
-        plan = planned(folder, record)
-        run, settings, evaluation = plan.run, plan.settings, plan.evaluation
-        start = folder if record.get("trained") else last_checkpoint(folder)
+        if record.status is Status.DIVERGED:
+            raise ConfigError(f"the run in {own} has ended: {record['error']}")
+        with record.reading():
+            run, evaluation = record.spec, record.evaluation
+            settings = Settings(record.settings)  # whose dotted paths are imported
+            check_settings(settings, run.algorithm)
+            if "n_timesteps" not in settings:
+                raise CorruptStateError(
+                    f"{record.source} is damaged: its settings lack n_timesteps; {CURE}"
+                )
+            tensorboard_log = str(record["tensorboard_log"])
+        start = own.start()
         failure = (
-            f"nothing was changed: the run in {folder} cannot go on from {start or 'its start'}"
+            f"nothing was changed: the run in {own} cannot go on from {start.folder or 'its start'}"
         )
-        with explained(failure, run.env_id), ExitStack() as stack:
-            observation_space, _ = spaces_of(run, settings, folder, evaluation)
+        with setup_errors(failure, run.env_id), ExitStack() as stack:
+            observation_space, _ = spaces_of(run, settings, own, evaluation)
             use_few_threads(observation_space)
-            if start is not None:
-                check_start(start, run)
-            if start != folder:
-                if start is not None:
-                    Evaluated.read(start)  # all is read before anything is replaced
-                stack.enter_context(restored_monitors(folder, start))
-            experiment = RunManager(run, settings, folder, evaluation, start, plan.tensorboard_log)
-            model = experiment.setup()
+            if start.folder is not None:
+                check_start(start.folder, run)
+            if not start.trained:
+                if start.folder is not None:
+                    Evaluated.read(start.folder)  # all is read before anything is replaced
+                stack.enter_context(restored_monitors(own.path, start.folder))
+            manager = RunManager(run, settings, own, evaluation, start, tensorboard_log)
+            model = manager.setup()
         watch = watch or Watch()
-        watch.begins(folder, None)
-        with recorded(folder, experiment.env_name, model):
-            return _learn(run, experiment, model, folder, start, callbacks, watch)
+        watch.begins(own.path, None)
+        return _Session(run, manager, model, callbacks, watch).outcome()
 
 
-def _learn(
-    run: RunSpec,
-    experiment: RunManager,
-    model: BaseAlgorithm,
-    folder: Path,
-    start: Path | None,
-    callbacks: Sequence[BaseCallback],
-    watch: Watch,
-    after_evaluation: BaseCallback | None = None,
-) -> Outcome:
-    policy = unwrapped(model.policy)
-    assert isinstance(policy, BaseSparsePolicy)
-    schedule = experiment.evaluation
-    envs = experiment.evaluation_envs(
-        min(EVALUATION_ENVS, schedule["eval_episodes"]), run.seed + 20_000
-    )
-    evaluation = Evaluation(
-        envs,
-        folder,
-        schedule["eval_freq"],
-        schedule["eval_episodes"],
-        experiment.deterministic_eval,
-        experiment.keep_normalization(),
-        watch,
-        after_evaluation,
-    )
-    checkpoints = Checkpoints(folder, experiment.env_name, evaluation)
-    during = [*experiment.callbacks, evaluation, checkpoints, *callbacks, watch]
-    if start is None:
-        evaluation.forget()
-    elif start != folder:
-        evaluation.restore(start)
-    done, planned = model.num_timesteps, experiment.n_timesteps
-    status = "running" if done < planned else "evaluating"
-    state: dict[str, Any] = {"device": str(model.device), "error": None}
-    if status == "running":
-        state["computing"] = computing_at(model, read_record(folder), folder)
-    write_record(folder, status=status, num_timesteps=done, **state, **sparsity_of(policy))
-    try:
-        if done < planned:
-            status = "evaluating"
+class _Session:
+    """What one process does of a run: training from its start on, and the last evaluation."""
+
+    def __init__(
+        self,
+        run: RunSpec,
+        manager: RunManager,
+        model: BaseAlgorithm,
+        callbacks: Sequence[BaseCallback],
+        watch: Watch,
+        after_evaluation: BaseCallback | None = None,
+    ) -> None:
+        self.run = run
+        self.manager = manager
+        self.model = model
+        self.folder = manager.folder
+        self.watch = watch
+        self.callbacks = callbacks
+        self.after_evaluation = after_evaluation
+        self.stop_wanted = False
+        policy = unwrapped(model.policy)
+        assert isinstance(policy, BaseSparsePolicy)
+        self.policy = policy
+
+    def outcome(self) -> Outcome:
+        """Bring the run to its end, or to where a signal stops it."""
+        episodes = self.manager.evaluation["eval_episodes"]
+        with recorded(self.folder, self.run.env_id, self.model):
+            envs = self.manager.evaluation_envs(
+                min(EVALUATION_ENVS, episodes), self.run.seed + 20_000
+            )
             try:
-                with checkpoints.on_signals(), denormals_as_zero(), diverging(model):
-                    model.learn(
-                        planned - done,
-                        callback=during,
-                        reset_num_timesteps=start is None,
-                        tb_log_name=f"{run.algo}_{folder.name}",
-                    )
-                    check_networks(model)
-            except StopTraining:
-                status = "interrupted"
-        path = experiment.save(model)
-        write_record(
-            folder,
-            status=status,
-            trained=status == "evaluating",
+                evaluation = Evaluation(
+                    envs,
+                    self.folder.path,
+                    self.manager.evaluation["eval_freq"],
+                    episodes,
+                    self.manager.deterministic_eval,
+                    self.manager.keep_normalization(),
+                    self.watch,
+                    self.after_evaluation,
+                )
+                status = self._train(evaluation)
+                path = self.manager.save(self.model)
+                self.folder.write(
+                    status=status,
+                    trained=status is Status.EVALUATING,
+                    num_timesteps=self.model.num_timesteps,
+                    **counts_of(self.policy),
+                )
+                if self.stop_wanted:
+                    return Outcome(self.folder.path, self.model, ())
+                results = final_results(
+                    self.run,
+                    self.model,
+                    path,
+                    envs,
+                    self.manager.deterministic_eval,
+                    episodes,
+                    self.watch,
+                )
+            finally:
+                envs.close()
+                assert self.model.env is not None
+                self.model.env.close()
+            told = [{**asdict(one), "path": one.path.name} for one in results]
+            self.folder.write(status=Status.FINISHED, results=told)
+            self.folder.clear_checkpoints()
+        return Outcome(self.folder.path, self.model, results)
+
+    def _train(self, evaluation: Evaluation) -> Status:
+        """Train what is left; whether it came to its end or was interrupted."""
+        start, model = self.manager.start, self.model
+        if start.folder is None:
+            evaluation.forget()
+        elif not start.trained:
+            evaluation.restore(start.folder)
+        left = self.manager.n_timesteps - model.num_timesteps
+        self.folder.write(
+            status=Status.RUNNING if left > 0 else Status.EVALUATING,
             num_timesteps=model.num_timesteps,
-            **sparsity_of(policy),
+            device=str(model.device),
+            error=None,
+            **({"computing": computing_at(model, self.folder.record())} if left > 0 else {}),
+            **counts_of(self.policy),
         )
-        if checkpoints.stop_wanted:
-            return Outcome(folder, model, ())
-        results = final_results(
-            run,
-            model,
-            path,
-            envs,
-            experiment.deterministic_eval,
-            schedule["eval_episodes"],
-            watch,
-        )
-    finally:
-        envs.close()
-        assert model.env is not None
-        model.env.close()
-    write_record(
-        folder, status="finished", results=[{**asdict(r), "path": r.path.name} for r in results]
-    )
-    clear_checkpoints(folder)
-    return Outcome(folder, model, results)
+        if left <= 0:
+            return Status.EVALUATING
+        checkpoints = Checkpoints(self.folder, self.run.env_id, evaluation)
+        during = [*self.manager.callbacks, evaluation, checkpoints, *self.callbacks, self.watch]
+        try:
+            with checkpoints.on_signals(), denormals_as_zero(), diverging(model):
+                model.learn(
+                    left,
+                    callback=during,
+                    reset_num_timesteps=start.folder is None,
+                    tb_log_name=f"{self.run.algo}_{self.folder.path.name}",
+                )
+                check_networks(model)
+        except StopTraining:
+            return Status.INTERRUPTED
+        finally:
+            self.stop_wanted = checkpoints.stop_wanted
+        return Status.EVALUATING

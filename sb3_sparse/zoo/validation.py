@@ -17,30 +17,23 @@ from sb3_sparse.policies.arguments import import_classes
 from sb3_sparse.policies.config import SPARSITY_MISSING, SparsityConfig
 from sb3_sparse.topology import method_named
 from sb3_sparse.zoo.arguments import kind_of
-from sb3_sparse.zoo.settings import (
-    CALLBACK,
-    SET_BY_THE_ENGINE,
-    Names,
-    find_callback,
-    has_own_callback,
-    policy_kwargs_of,
-)
+from sb3_sparse.zoo.settings import CALLBACK, SET_BY_THE_RUN, Names, Settings
 
 OF_SPARSITY = frozenset(one.name for one in fields(SparsityConfig))
 
 
-def check_settings(settings: Mapping[str, Any], algorithm: type[BaseAlgorithm]) -> None:
-    """Refuse settings that could not be trained, or not as what they say.
+def check_settings(settings: Settings, algorithm: type[BaseAlgorithm]) -> None:
+    """Reject settings that cannot be trained, or not as they say.
 
     :raises ConfigError: for a key that nothing takes, a value that is not allowed, or a sparsity
         that training would not reach
     """
-    kwargs, callback = policy_kwargs_of(settings), find_callback(settings)
+    kwargs, callback = settings.policy_kwargs, settings.callback
     names = Names.of(algorithm)
     algo = algorithm.__name__
     _check_keys(settings, names.algorithm, f"{algo} and rl-zoo have no setting", names)
     _check_keys(kwargs, names.policy, f"policy_kwargs of {algo} have no", names)
-    if callback is not None and not has_own_callback(settings):
+    if callback is not None and not settings.has_own_callback:
         allowed = names.schedule | {"method", "verbose"}
         _check_keys(callback, allowed, f"{CALLBACK} has no argument", names)
     for part in (settings, kwargs, callback or {}, kwargs.get("optimizer_kwargs") or {}):
@@ -59,7 +52,7 @@ def check_settings(settings: Mapping[str, Any], algorithm: type[BaseAlgorithm]) 
         raise ConfigError(SPARSITY_MISSING)
     SparsityConfig(**{name: value for name, value in kwargs.items() if name in OF_SPARSITY})
     check_weight_decay(kwargs.get("weight_decay", 0.0), kwargs.get("optimizer_kwargs"))
-    if callback is not None and not has_own_callback(settings):
+    if callback is not None and not settings.has_own_callback:
         SparsityCallback(**callback)
     _check_start(kwargs, callback)
 
@@ -74,7 +67,7 @@ def _check_keys(given: Mapping[str, Any], allowed: Set[str], what: str, names: N
             cure = f"; it is the mask's schedule's: put it under {CALLBACK}"
         elif name in names.algorithm:
             cure = "; it is the algorithm's: put it beside policy_kwargs"
-        elif name in SET_BY_THE_ENGINE:
+        elif name in SET_BY_THE_RUN:
             cure = "; it is an option of its own"
         else:
             cure = did_you_mean(name, allowed)

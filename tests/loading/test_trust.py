@@ -21,9 +21,8 @@ from torch import nn
 from sb3_sparse import SparseSACPolicy, cli
 from sb3_sparse.errors import ConfigError, CorruptStateError
 from sb3_sparse.loading.zooyaml import NotBuilt, read_zoo_yaml
-from sb3_sparse.zoo.finetune import check_wrappers
 from sb3_sparse.zoo.inspection import inspect_model
-from sb3_sparse.zoo.saved import algos_of
+from sb3_sparse.zoo.saved import algos_of, check_wrappers
 
 
 class Payload:

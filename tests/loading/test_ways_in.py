@@ -19,7 +19,7 @@ from sb3_sparse.loading.statistics import load_statistics, read_statistics
 from sb3_sparse.loading.text import read_text
 from sb3_sparse.studies import Study
 from sb3_sparse.zoo.inspection import inspect_model
-from sb3_sparse.zoo.saved import find_saved
+from sb3_sparse.zoo.saved import SavedModel
 from sb3_sparse.zoo.scoring import enjoy
 from sb3_sparse.zoo.spec import RunSpec
 from sb3_sparse.zoo.training import train
@@ -88,7 +88,7 @@ def test_a_run_without_its_config_is_never_taken_for_one_without_normalisation(
     (folder / ENV / "config.yml").unlink()
     said = mistake(command, str(folder))
     assert f"{ENV}/config.yml is missing, which says how the run's environment was wrapped" in said
-    given = find_saved(folder, vecnormalize=folder / ENV / "vecnormalize.pkl")
+    given = SavedModel.find(folder, vecnormalize=folder / ENV / "vecnormalize.pkl")
     assert given.vecnormalize is not None
 
 
@@ -107,9 +107,11 @@ def test_statistics_beside_a_lone_zip_are_not_passed_over(tmp_path):
     envs = VecNormalize(make_vec_env(ENV))
     envs.save(str(tmp_path / "vecnormalize.pkl"))
     with pytest.raises(ConfigError, match="lies beside .*model.zip: give --vecnormalize"):
-        find_saved(tmp_path / "model.zip", env_id=ENV)
+        SavedModel.find(tmp_path / "model.zip", env_id=ENV)
     statistics = tmp_path / "vecnormalize.pkl"
-    assert find_saved(tmp_path / "model.zip", vecnormalize=statistics).vecnormalize == statistics
+    assert (
+        SavedModel.find(tmp_path / "model.zip", vecnormalize=statistics).vecnormalize == statistics
+    )
 
 
 def test_statistics_of_other_observations_are_refused(tmp_path):
@@ -204,7 +206,7 @@ def test_looking_at_a_run_writes_nothing_into_it(read_only):
     before = everything(read_only)
     inspect_model(read_only)
     enjoy(read_only, 1)
-    find_saved(read_only).load()
+    SavedModel.find(read_only).load()
     assert everything(read_only) == before
 
 

@@ -12,7 +12,7 @@ from sb3_sparse.cli.study import report, status
 from sb3_sparse.errors import CorruptStateError, SparsityWarning
 from sb3_sparse.studies import run_study, status_of
 from sb3_sparse.zoo.archive import Archive
-from sb3_sparse.zoo.record import read_record
+from sb3_sparse.zoo.folder import RunFolder
 
 NOISE = {"noise": {"sigmas": [0, 2], "n_episodes": 3}}
 DIVERGES = {"method": "static", "sparsity": 0.5, "hyperparams": {"learning_rate": 1e35}}
@@ -34,15 +34,15 @@ def test_each_cell_that_is_over_is_a_line_with_all_that_came_out(trained):
     assert list(lines) == [cell.address for cell in made.cells]
     for cell in made.cells:
         (line,) = lines[cell.address]
-        where = cell.folder(folder / "store")
-        assert line.record == read_record(where)
+        where = cell.folder(folder / "store").path
+        assert line.record == RunFolder(where).record()
         if line.record["status"] == "finished":
             assert line.timesteps.tolist() == [100.0, 200.0, 300.0]
             assert line.returns.shape == line.lengths.shape == (3, 1)
             assert line.measured == {"robustness.csv": (where / "robustness.csv").read_text()}
         else:
             assert line.record["status"] == "diverged"
-            assert str(folder) not in json.dumps(line.record)  # of whom would it tell?
+            assert str(folder) not in json.dumps(dict(line.record))  # of whom would it tell?
 
 
 def test_what_is_in_the_archive_is_not_run_again_without_its_folder(trained, tmp_path):
@@ -69,7 +69,7 @@ def test_what_lies_done_in_folders_is_archived_before_anything_is_run(trained, t
 def test_a_folder_that_cannot_be_archived_is_named_and_hides_no_other(trained, tmp_path):
     folder, made = trained
     shutil.copytree(folder / "store", tmp_path / "store")
-    (made.cells[0].folder(tmp_path / "store") / "evaluations.npz").unlink()
+    (made.cells[0].folder(tmp_path / "store").path / "evaluations.npz").unlink()
     with pytest.warns(SparsityWarning, match="does not go into the archive: .*evaluations.npz"):
         finish(made, tmp_path / "store", archive=tmp_path / "runs.jsonl")
     assert len(Archive(tmp_path / "runs.jsonl").read()) == 2
@@ -123,9 +123,9 @@ def test_a_cell_of_which_more_is_to_be_measured_is_not_done(trained, tmp_path):
     more = {"noise": {"sigmas": [1], "n_episodes": 2}}
     noisy = study(tmp_path, runs=RUNS[1:], measures=more)
     (cell,) = noisy.cells
-    zip_of = cell.folder(tmp_path / "store") / "CartPole-v1.zip"
+    zip_of = cell.folder(tmp_path / "store").path / "CartPole-v1.zip"
     before = zip_of.stat().st_mtime_ns
-    assert status_of(cell, tmp_path / "store", Archive(archive).read()).status == "stopped"
+    assert status_of(cell, tmp_path / "store", Archive(archive).read()).state == "stopped"
     assert finish(noisy, tmp_path / "store", archive=archive).done == 1
     assert zip_of.stat().st_mtime_ns == before
     first, second = Archive(archive).read()[cell.address]
@@ -135,7 +135,7 @@ def test_a_cell_of_which_more_is_to_be_measured_is_not_done(trained, tmp_path):
     )
     shutil.rmtree(tmp_path / "store")
     less = study(tmp_path, runs=RUNS[1:], measures={"noise": {"sigmas": [3], "n_episodes": 1}})
-    assert status_of(cell, tmp_path / "store", Archive(archive).read()).status == "done"
+    assert status_of(cell, tmp_path / "store", Archive(archive).read()).state == "done"
     launcher = Here()
     assert finish(less, tmp_path / "store", launcher, archive).done == 1
     assert launcher.called == [cell.name]

@@ -13,7 +13,7 @@ from support import ALGORITHMS, make
 
 import sb3_sparse
 from sb3_sparse.algorithms.table import HOMES, trainer_of
-from sb3_sparse.zoo.saved import find_saved
+from sb3_sparse.zoo.saved import SavedModel
 from sb3_sparse.zoo.spec import RunSpec, algorithms
 from sb3_sparse.zoo.training import resume, train
 
@@ -45,7 +45,7 @@ def test_runs_train_and_go_on_with_our_class(tmp_path):
     assert outcome.finished
     assert type(outcome.model) is sb3_sparse.DQN
     assert outcome.model.num_timesteps == 300
-    saved = find_saved(stopped.folder)
+    saved = SavedModel.find(stopped.folder)
     assert type(saved.load()) is sb3_sparse.DQN
     assert type(saved.load(make_vec_env("CartPole-v1"))) is sb3_sparse.DQN
     stock = stable_baselines3.DQN.load(saved.path)
@@ -55,7 +55,7 @@ def test_runs_train_and_go_on_with_our_class(tmp_path):
 @pytest.mark.parametrize("name", ["SAC", "TQC"])
 def test_files_of_stock_algorithms_load(tmp_path, name):
     make(name).save(tmp_path / "model.zip")
-    loaded = find_saved(tmp_path / "model.zip").load(make_vec_env("Pendulum-v1"))
+    loaded = SavedModel.find(tmp_path / "model.zip").load(make_vec_env("Pendulum-v1"))
     assert type(loaded) is algorithms()[name.lower()]
     loaded.learn(30)
 

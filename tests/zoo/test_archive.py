@@ -13,13 +13,15 @@ import pytest
 from sb3_sparse.errors import ConfigError, CorruptStateError, SparsityWarning, Unwritable
 from sb3_sparse.zoo import archive as module
 from sb3_sparse.zoo.archive import Archive, Archived
+from sb3_sparse.zoo.folder import RunFolder
+from sb3_sparse.zoo.record import Record
 
 
 def run(address="a" * 12, status="finished", **record):
     returns = np.array([[1.0, 2.5], [-3.123456, 500.0]])
     return Archived(
         address,
-        {"status": status, "run": {"seed": 0}, **record},
+        Record({"status": status, "run": {"seed": 0}, **record}),
         np.array([100.0, 200.0]),
         returns,
         np.array([[1.0, 2.0], [3.0, 500.0]]),
@@ -41,7 +43,7 @@ def test_what_is_added_is_read_again_to_the_last_digit(tmp_path):
 
 def test_a_line_is_short_and_plain_json(tmp_path):
     archive = Archive(tmp_path / "runs.jsonl")
-    archive.add([run(), Archived("b" * 12, {"status": "counted"})])
+    archive.add([run(), Archived("b" * 12, Record({"status": "counted"}))])
     first, second = archive.path.read_text().splitlines()
     assert first == (
         '{"address":"aaaaaaaaaaaa","record":{"status":"finished","run":{"seed":0}},'
@@ -57,17 +59,17 @@ def test_a_run_folder_becomes_a_line(tmp_path):
     np.savez(tmp_path / "evaluations.npz", timesteps=[7], results=[[1.5]], ep_lengths=[[9]])
     (tmp_path / "snr.csv").write_text("a,b\n")
     (tmp_path / "0.monitor.csv").write_text("of no interest")
-    found = Archived.of_folder(tmp_path, "c" * 12, ["snr.csv", "plasticity.csv"])
+    found = Archived.of_folder(RunFolder(tmp_path), "c" * 12, ["snr.csv", "plasticity.csv"])
     assert (found.record, found.measured) == (record, {"snr.csv": "a,b\n"})
     assert [x.tolist() for x in (found.timesteps, found.returns, found.lengths)] == (
         [[7.0], [[1.5]], [[9.0]]]
     )
     (tmp_path / "evaluations.npz").unlink()
     with pytest.raises(ConfigError, match=r"there is no file .*evaluations.npz"):
-        Archived.of_folder(tmp_path, "c" * 12, [])
+        Archived.of_folder(RunFolder(tmp_path), "c" * 12, [])
     (tmp_path / "sparsity.json").write_text('{"status": "running"}')
     with pytest.raises(ConfigError, match="is not over: its status is running"):
-        Archived.of_folder(tmp_path, "c" * 12, [])
+        Archived.of_folder(RunFolder(tmp_path), "c" * 12, [])
 
 
 def test_a_run_is_added_once_and_again_only_with_more_measured(tmp_path):
@@ -142,8 +144,8 @@ EVALUATIONS = json.loads(run().line())["evaluations"]
         (b'{"address": "x"}', "KeyError: 'record'"),
         (b"[" * 100_000, "RecursionError"),
         (spoilt(address=3), "its address is 3"),
-        (spoilt(record=[]), "TypeError"),
-        (spoilt(record={"status": "running"}), "its status is 'running', not finished or counted"),
+        (spoilt(record=[]), "AttributeError"),
+        (spoilt(record={"status": "running"}), "its status is 'running', and its run is not over"),
         (spoilt(record={"status": "finished", "num_timesteps": "x"}), "ValueError"),
         (spoilt(record={"status": "finished", "measured": 3}), "TypeError"),
         (spoilt(measured={"a.csv": 3}), "measured must map names"),

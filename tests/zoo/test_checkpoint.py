@@ -13,8 +13,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_sparse.errors import ConfigError, RunBusy, SparsityError
 from sb3_sparse.zoo import checkpoint
-from sb3_sparse.zoo.checkpoint import is_locked, last_checkpoint, locked
-from sb3_sparse.zoo.record import read_record
+from sb3_sparse.zoo.folder import RunFolder
 from sb3_sparse.zoo.spec import RunSpec
 from sb3_sparse.zoo.training import resume, train
 
@@ -51,7 +50,7 @@ class Killed(BaseCallback):
 
     def _on_step(self) -> bool:
         (folder,) = self.root.glob("dqn/*")
-        found = last_checkpoint(folder)
+        found = RunFolder(folder).last_checkpoint()
         self.seen.add(None if found is None else int(found.name))
         if self.num_timesteps == 150:
             raise OSError("killed")
@@ -67,7 +66,7 @@ def test_a_kill_before_the_first_evaluation_costs_two_minutes_at_most(
     with pytest.raises(OSError, match="killed"):
         train(RUN, tmp_path, [killed])
     (folder,) = (tmp_path / "dqn").iterdir()
-    found = last_checkpoint(folder)
+    found = RunFolder(folder).last_checkpoint()
     assert (None if found is None else int(found.name)) == saved
     assert len(killed.seen) == (150 if saved else 1)
     assert resume(folder).finished
@@ -102,7 +101,7 @@ def content(folder: Path) -> dict[Path, bytes]:
     ],
 )
 def test_a_damaged_file_of_a_checkpoint_costs_nothing_of_the_run(name, folder):
-    damaged = last_checkpoint(folder) / name
+    damaged = RunFolder(folder).last_checkpoint() / name
     whole = damaged.read_bytes()
     damaged.write_bytes(whole[: len(whole) // 2])
     (folder / "best_model.zip").write_bytes(b"better than the checkpoint's")
@@ -116,31 +115,34 @@ def test_a_damaged_file_of_a_checkpoint_costs_nothing_of_the_run(name, folder):
 
 
 def test_a_run_is_not_trained_over_another(folder):
-    before = read_record(folder)
+    before = RunFolder(folder).record()
     with pytest.raises(ConfigError, match="there is a run in .* already; go on with it"):
         train(RUN, folder=folder)
-    assert read_record(folder) == before
-    assert last_checkpoint(folder).name == "500"
+    assert RunFolder(folder).record() == before
+    assert RunFolder(folder).last_checkpoint().name == "500"
 
 
 def test_seeing_whether_a_run_is_locked_writes_nothing_and_stops_nobody(tmp_path):
-    assert not is_locked(tmp_path)
+    assert not RunFolder(tmp_path).is_locked()
     assert list(tmp_path.iterdir()) == []
-    with locked(tmp_path):
-        assert is_locked(tmp_path)
-        with pytest.raises(RunBusy, match="another process is at work"), locked(tmp_path):
+    with RunFolder(tmp_path).locked():
+        assert RunFolder(tmp_path).is_locked()
+        with (
+            pytest.raises(RunBusy, match="another process is at work"),
+            RunFolder(tmp_path).locked(),
+        ):
             pass
     (tmp_path / ".lock").touch()  # of a process that was killed
     looking = Event()
 
     def look():
         while not looking.is_set():
-            is_locked(tmp_path)
+            RunFolder(tmp_path).is_locked()
 
     watcher = Thread(target=look)
     watcher.start()
     for _ in range(20):
-        with locked(tmp_path):
+        with RunFolder(tmp_path).locked():
             pass
     looking.set()
     watcher.join()

@@ -22,8 +22,9 @@ from sb3_sparse.zoo.computing import (
     computing_in,
     gradient_steps_of,
 )
+from sb3_sparse.zoo.folder import RunFolder
 from sb3_sparse.zoo.inspection import inspect_model
-from sb3_sparse.zoo.record import read_record, write_record
+from sb3_sparse.zoo.record import Record
 from sb3_sparse.zoo.spec import RunSpec
 from sb3_sparse.zoo.training import resume, train
 
@@ -52,7 +53,7 @@ def run(method: str = "rigl", steps: int = 300, **hyperparams) -> RunSpec:
 
 
 def layers_of(folder: Path) -> dict[str, str]:
-    return {layer["name"]: layer["compute"] for layer in read_record(folder)["layers"]}
+    return {layer["name"]: layer["compute"] for layer in RunFolder(folder).record()["layers"]}
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +62,7 @@ def trained(tmp_path_factory) -> Path:
 
 
 def test_the_record_says_what_was_asked_for_and_what_decides_rounding(trained):
-    found = computing_in(read_record(trained), trained)
+    found = computing_in(RunFolder(trained).record())
     sparse = dict.fromkeys(NAMES, "sparse")
     capability = th.backends.cpu.get_cpu_capability()
     sitting = Sitting(0, library.in_use(), capability, th.get_num_threads(), sparse, "fused")
@@ -71,7 +72,7 @@ def test_the_record_says_what_was_asked_for_and_what_decides_rounding(trained):
 
 def test_masks_that_are_asked_for_are_on_record(tmp_path):
     folder = train(run(compute="masked"), tmp_path).folder
-    found = computing_in(read_record(folder), folder)
+    found = computing_in(RunFolder(folder).record())
     assert found.asked == "masked"
     assert found.sittings[0].layers[NAMES[1]] == layers_of(folder)[NAMES[1]] == "masked"
 
@@ -79,7 +80,7 @@ def test_masks_that_are_asked_for_are_on_record(tmp_path):
 def test_pruning_changes_how_layers_compute_and_the_record_has_both(tmp_path):
     pruned = run("prune", 600, update_interval=5)
     folder = train(pruned, tmp_path).folder
-    (sitting,) = computing_in(read_record(folder), folder).sittings
+    (sitting,) = computing_in(RunFolder(folder).record()).sittings
     assert sitting.layers == dict.fromkeys(NAMES, "dense")
     assert layers_of(folder) == dict.fromkeys(NAMES, "sparse")
     told = str(inspect_model(folder))
@@ -89,9 +90,9 @@ def test_pruning_changes_how_layers_compute_and_the_record_has_both(tmp_path):
 def test_a_run_that_is_gone_on_with_has_a_sitting_more(tmp_path):
     pruned = run("prune", 1000, update_interval=5)
     stopped = train(pruned, tmp_path, [CtrlC()])
-    steps = read_record(stopped.folder)["num_timesteps"]
+    steps = RunFolder(stopped.folder).record()["num_timesteps"]
     resume(stopped.folder)
-    first, second = computing_in(read_record(stopped.folder), stopped.folder).sittings
+    first, second = computing_in(RunFolder(stopped.folder).record()).sittings
     assert (first.num_timesteps, second.num_timesteps) == (0, steps)
     assert first.layers == dict.fromkeys(NAMES, "dense")
     assert second.layers == dict.fromkeys(NAMES, "sparse")  # before its first gradient step
@@ -99,10 +100,10 @@ def test_a_run_that_is_gone_on_with_has_a_sitting_more(tmp_path):
 
 def test_sittings_that_came_to_nothing_are_forgotten(trained):
     model = train(run(), trained.parent.parent).model
-    record = read_record(trained)
+    record = dict(RunFolder(trained).record())
     for steps in (200, 400, 200):
         model.num_timesteps = steps
-        record["computing"] = computing_at(model, record, trained)
+        record["computing"] = computing_at(model, Record(record))
     assert [one["num_timesteps"] for one in record["computing"]["sittings"]] == [0, 200]
 
 
@@ -167,7 +168,7 @@ def test_records_that_say_non_zeros_are_read_as_sparse(trained, record):
     ],
 )
 def test_a_damaged_record_is_named(trained, record, damage):
-    write_record(trained, **damage)
+    RunFolder(trained).write(**damage)
     with pytest.raises(CorruptStateError, match=r"sparsity\.json"):
         inspect_model(trained)
 

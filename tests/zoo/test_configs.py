@@ -13,7 +13,7 @@ from sb3_sparse.errors import ConfigError
 from sb3_sparse.zoo import config_path
 from sb3_sparse.zoo.configs import METHODS, entry_of, evaluation_of
 from sb3_sparse.zoo.environments import is_atari
-from sb3_sparse.zoo.settings import CALLBACK, ZOO_KEYS, _arguments, method_of
+from sb3_sparse.zoo.settings import CALLBACK, ZOO_KEYS, Settings, _arguments
 from sb3_sparse.zoo.spec import RunSpec, algorithms
 
 SHIPPED = sorted(configs.config_root().glob("*/*.yml"))
@@ -36,7 +36,7 @@ def assert_sparse_settings(settings, method, row):
         kwargs.get("sparsity_aware_init"),
     )
     assert found == row
-    assert method_of(settings) == method
+    assert Settings(settings).method == method
     assert kwargs["sparsity"] == (0.0 if method == "dense" else 0.9)
     assert kwargs.get("initial_sparsity") == (0.0 if method == "prune" else None)
 
@@ -170,7 +170,7 @@ def test_every_key_is_known_to_the_algorithm_the_policy_or_the_zoo(path):
         settings = entry_of(path, key, atari=key == "atari")
         assert set(settings) <= _arguments(algorithm) | ZOO_KEYS, key
         assert set(settings["policy_kwargs"]) <= policy, key
-        assert method_of(settings) == path.parent.name
+        assert Settings(settings).method == path.parent.name
 
 
 def test_every_method_has_every_algorithm():

@@ -23,10 +23,9 @@ from sb3_sparse.tuning import tune
 from sb3_sparse.tuning.backend import optuna
 from sb3_sparse.tuning.spaces import Space
 from sb3_sparse.zoo.environments import import_packages, plain_id
-from sb3_sparse.zoo.finetune import evaluation_envs, training_envs, write_run_files
-from sb3_sparse.zoo.folder import arguments_of
+from sb3_sparse.zoo.folder import RunFolder
 from sb3_sparse.zoo.inspection import inspect_model
-from sb3_sparse.zoo.saved import find_saved
+from sb3_sparse.zoo.saved import SavedModel
 from sb3_sparse.zoo.scoring import enjoy
 from sb3_sparse.zoo.spec import RunSpec
 from sb3_sparse.zoo.training import resume, train
@@ -84,7 +83,7 @@ def trained(package, tmp_path_factory):
 def test_a_run_remembers_the_package_and_lies_in_a_folder_of_the_plain_id(trained):
     assert (trained.parent.name, trained.name) == ("dqn", "Tiny-v0_1")
     assert (trained / "Tiny-v0.zip").is_file()
-    arguments = arguments_of(trained)
+    arguments = RunFolder(trained).arguments()
     assert (arguments["env"], arguments["gym_packages"]) == ("Tiny-v0", ["tiny_envs"])
 
 
@@ -115,17 +114,17 @@ def test_a_run_that_reaches_another_process_imports_its_package_there(package):
 def test_a_run_is_watched_exported_and_made_sparser_by_its_folder_alone(trained, tmp_path):
     assert enjoy(trained, episodes=2).mean_return <= 20
     forget()
-    saved = find_saved(trained)
-    envs = evaluation_envs(saved, 1, 0)
+    saved = SavedModel.find(trained)
+    envs = saved.evaluation_envs(1, 0)
     export_policy(saved.load(), tmp_path / "policy", "numpy")
     assert (tmp_path / "policy.npz").is_file()
     forget()
-    training = training_envs(saved, 1, 0)
+    training = saved.training_envs(1, 0)
     compress_model(
         saved.load(training), envs, tmp_path / "out", sparsity=0.95, steps=100, episodes=2
     )
-    write_run_files(saved, tmp_path / "out")
-    assert arguments_of(tmp_path / "out")["gym_packages"] == ["tiny_envs"]
+    saved.write_run_files(tmp_path / "out")
+    assert RunFolder(tmp_path / "out").arguments()["gym_packages"] == ["tiny_envs"]
 
 
 def test_looking_into_a_model_imports_nothing(trained):
@@ -137,7 +136,7 @@ def test_a_model_is_exported_where_the_package_of_its_environment_is_missing(
     trained, package, tmp_path, monkeypatch
 ):
     monkeypatch.setattr(sys, "path", [one for one in sys.path if one != str(package)])
-    export_policy(find_saved(trained).load(), tmp_path / "policy", "numpy")
+    export_policy(SavedModel.find(trained).load(), tmp_path / "policy", "numpy")
     with pytest.raises(ConfigError, match="there is no package 'tiny_envs'"):
         enjoy(trained, episodes=1)
 
@@ -150,18 +149,16 @@ def test_a_zip_elsewhere_takes_the_package_from_the_environments_id(trained, tmp
         dict(env_id="Tiny-v0", gym_packages=["tiny_envs"]),
     ):
         forget()
-        saved = find_saved(elsewhere, **given)
+        saved = SavedModel.find(elsewhere, **given)
         assert saved.env_id == "Tiny-v0"
-        evaluation_envs(saved, 1, 0).close()
-    write_run_files(saved, tmp_path / "run")
-    assert arguments_of(tmp_path / "run")["gym_packages"] == ["tiny_envs"]
+        saved.evaluation_envs(1, 0).close()
+    saved.write_run_files(tmp_path / "run")
+    assert RunFolder(tmp_path / "run").arguments()["gym_packages"] == ["tiny_envs"]
 
 
 def test_an_interrupted_run_goes_on_in_a_new_process(package, tmp_path):
-    from sb3_sparse.zoo.record import write_record
-
     folder = train(RunSpec(env_id="tiny_envs:Tiny-v0", **SHORT), tmp_path).folder
-    write_record(folder, status="evaluating", trained=True)
+    RunFolder(folder).write(status="evaluating", trained=True)
     forget()
     assert resume(folder).finished
 
@@ -185,7 +182,7 @@ def test_a_run_that_rl_zoo_made_is_watched(package, tmp_path):
     (folder,) = (tmp_path / "logs" / "dqn").glob("Tiny-v0_*")
     assert enjoy(folder, episodes=1).episodes == 1
     forget()
-    evaluation_envs(find_saved(folder), 1, 0).close()
+    SavedModel.find(folder).evaluation_envs(1, 0).close()
 
 
 def test_workers_of_a_tuning_import_it(package, tmp_path):
@@ -212,7 +209,7 @@ def test_studies_name_it_too(named, package, tmp_path):
         *_, last = run_study(study, tmp_path / "store", launcher_named("local"), 1)
         assert (last.done, last.failed) == (1, {})
         forget()
-        folders = [status_of(cell, tmp_path / "store").folder]
+        folders = [status_of(cell, tmp_path / "store").folder.path]
         assert write_report(folders, tmp_path / "out", title="T", figures=["curves"]).is_file()
 
 

@@ -4,9 +4,8 @@ import gymnasium as gym
 import pytest
 from support import make
 
-from sb3_sparse.zoo.finetune import envs_of
 from sb3_sparse.zoo.mujoco import mujoco_warns_once
-from sb3_sparse.zoo.saved import find_saved
+from sb3_sparse.zoo.saved import SavedModel
 
 mujoco = pytest.importorskip("mujoco")
 
@@ -29,7 +28,7 @@ def test_environments_of_a_saved_model_are_as_quiet(tmp_path, monkeypatch, capfd
     monkeypatch.chdir(tmp_path)
     with mujoco_warns_once("HalfCheetah-v5"):
         make("SAC", "HalfCheetah-v5").save("model")
-    envs_of(find_saved(tmp_path / "model.zip", env_id="HalfCheetah-v5"), 3, seed=0).close()
+    SavedModel.find(tmp_path / "model.zip", env_id="HalfCheetah-v5").envs(3, 0).close()
     out, err = capfd.readouterr()
     assert "WARNING" not in out + err
     assert [path.name for path in tmp_path.iterdir()] == ["model.zip"]

@@ -19,7 +19,7 @@ from sb3_sparse.errors import ConfigError
 from sb3_sparse.export import export_policy
 from sb3_sparse.policies import registry
 from sb3_sparse.zoo.inspection import inspect_model
-from sb3_sparse.zoo.saved import find_saved
+from sb3_sparse.zoo.saved import SavedModel
 from sb3_sparse.zoo.scoring import enjoy
 from sb3_sparse.zoo.spec import RunSpec
 from sb3_sparse.zoo.training import train
@@ -69,7 +69,7 @@ def folder(tmp_path_factory):
 
 def test_it_is_trained_and_its_folder_says_all_that_loading_needs(folder):
     assert (folder.parent.name, folder.name) == ("cautioussac", "Pendulum-v1_1")
-    saved = find_saved(folder)
+    saved = SavedModel.find(folder)
     model = saved.load()
     assert (saved.algo, type(model).__name__, model.caution) == ("cautioussac", "CautiousSAC", 0.2)
     assert enjoy(folder, episodes=1).episodes == 1
@@ -81,7 +81,7 @@ def test_it_is_looked_into_without_running_it(folder):
 
 
 def test_its_gradient_step_is_counted(folder):
-    report = flops(find_saved(folder).load())
+    report = flops(SavedModel.find(folder).load())
     assert report.algorithm == "CautiousSAC"
     layers = {layer.name: layer for layer in report.layers}
     first = layers["actor.first.0"]
@@ -89,7 +89,7 @@ def test_its_gradient_step_is_counted(folder):
 
 
 def test_its_snr_is_measured_once_it_has_losses(folder):
-    model = find_saved(folder).load()
+    model = SavedModel.find(folder).load()
     space = model.observation_space
     observations = th.rand(8, *space.shape)
     batch = ReplayBufferSamples(
@@ -117,7 +117,7 @@ def test_its_snr_is_measured_once_it_has_losses(folder):
 
 
 def test_it_is_exported_and_a_sparser_twin_of_it_is_made(folder, tmp_path):
-    model = find_saved(folder).load()
+    model = SavedModel.find(folder).load()
     for to in ("numpy", "c", "onnx"):
         assert export_policy(model, tmp_path / "policy", to).parity.holds
     twin = sparsify(model, 0.9)
@@ -127,7 +127,7 @@ def test_it_is_exported_and_a_sparser_twin_of_it_is_made(folder, tmp_path):
 
 def test_a_zip_elsewhere_tells_its_algorithm(folder, tmp_path):
     (tmp_path / "model.zip").write_bytes((folder / "Pendulum-v1.zip").read_bytes())
-    assert find_saved(tmp_path / "model.zip").algo == "cautioussac"
+    assert SavedModel.find(tmp_path / "model.zip").algo == "cautioussac"
 
 
 @pytest.mark.parametrize(

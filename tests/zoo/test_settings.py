@@ -9,7 +9,7 @@ import pytest
 from stable_baselines3 import DQN, PPO, SAC
 
 from sb3_sparse.errors import ConfigError
-from sb3_sparse.zoo.settings import CALLBACK, apply_overrides, method_of, parse_overrides
+from sb3_sparse.zoo.settings import CALLBACK, Settings, parse_overrides
 from sb3_sparse.zoo.spec import RunSpec
 
 
@@ -33,29 +33,27 @@ def test_each_name_finds_its_own_place():
         "update_interval": 9,
         "drop_fraction": 0.1,
     }
-    apply_overrides(settings, overrides, SAC)
-    assert settings == {
+    assert Settings(settings).changed(overrides, SAC) == {
         "policy": "sb3_sparse.SparsePolicy",
         "learning_rate": 0.2,
         "n_envs": 3,
         "policy_kwargs": {"sparsity": 0.9, "net_arch": [8, 8], "weight_decay": 1e-4},
         "callback": [{CALLBACK: {"method": "rigl", "update_interval": 9, "drop_fraction": 0.1}}],
     }
+    assert settings == base()
 
 
 def test_policy_kwargs_are_merged_so_that_the_sparsity_is_not_lost():
-    settings = base()
-    apply_overrides(settings, {"policy_kwargs": {"net_arch": [2]}}, DQN)
+    settings = Settings(base()).changed({"policy_kwargs": {"net_arch": [2]}}, DQN)
     assert settings["policy_kwargs"] == {"sparsity": 0.9, "net_arch": [2]}
 
 
 def test_arguments_of_every_base_class_count():
-    settings = base()
     overrides = {"ortho_init": False, "clip_range": 0.1, "n_critics": 3}
-    apply_overrides(settings, {"n_critics": 3}, SAC)
+    settings = Settings(base()).changed({"n_critics": 3}, SAC)
     assert settings["policy_kwargs"]["n_critics"] == 3
     with pytest.raises(ConfigError, match="PPO has no hyperparameter 'n_critics'"):
-        apply_overrides(base(), overrides, PPO)
+        Settings(base()).changed(overrides, PPO)
 
 
 @pytest.mark.parametrize(
@@ -71,10 +69,8 @@ def test_arguments_of_every_base_class_count():
     ],
 )
 def test_unknown_names_are_refused(name, message):
-    settings = base()
     with pytest.raises(ConfigError, match=message):
-        apply_overrides(settings, {name: 1}, SAC)
-    assert settings == base()
+        Settings(base()).changed({name: 1}, SAC)
 
 
 def test_a_schedule_without_a_callback_is_refused():
@@ -114,13 +110,13 @@ def test_a_text_without_name_or_value_is_refused(text):
 
 
 def test_the_method_is_read_off_the_callback_or_the_sparsity():
-    assert method_of(base()) == "rigl"
-    assert method_of(base(callback=None)) == "static"
+    assert Settings(base()).method == "rigl"
+    assert Settings(base(callback=None)).method == "static"
     dense = base(policy_kwargs={"sparsity": 0.0})
     dense.pop("callback")
-    assert method_of(dense) == "dense"
+    assert Settings(dense).method == "dense"
     with pytest.raises(ConfigError, match="unknown method 'rig'"):
-        method_of(base(callback=[{CALLBACK: {"method": "rig"}}]))
+        Settings(base(callback=[{CALLBACK: {"method": "rig"}}])).method  # noqa: B018
 
 
 def test_what_the_user_wants_wins_over_the_config():
@@ -193,9 +189,9 @@ def test_overrides_cannot_turn_a_method_into_another(run):
 
 def test_the_callback_is_known_by_any_path():
     path = "sb3_sparse.callback.SparsityCallback"
-    settings = base(callback=[{path: {"method": "set"}}, "os.path.join", {"no.such.Thing": {}}])
-    assert method_of(settings) == "set"
-    apply_overrides(settings, {"update_interval": 3}, SAC)
+    callbacks = [{path: {"method": "set"}}, "os.path.join", {"no.such.Thing": {}}]
+    assert Settings(base(callback=callbacks)).method == "set"
+    settings = Settings(base(callback=callbacks)).changed({"update_interval": 3}, SAC)
     assert settings["callback"][0] == {path: {"method": "set", "update_interval": 3}}
 
 
@@ -212,7 +208,7 @@ def test_a_file_of_ones_own_decides_the_method(tmp_path):
         '  policy_kwargs: "dict(sparsity=0.5, net_arch=[8])"\n'
     )
     settings = RunSpec(conf_file=str(path)).settings()
-    assert method_of(settings) == "static"
+    assert settings.method == "static"
     assert settings["policy_kwargs"] == {"sparsity": 0.5, "net_arch": [8]}
     assert type(settings["n_timesteps"]) is int
     with pytest.raises(ConfigError, match="trains with method 'static', not 'rigl'"):
@@ -246,4 +242,32 @@ def test_numpys_numbers_are_pythons_in_the_settings_and_on_record():
         hyperparams={"gamma": 0.9, "net_arch": [8], "batch_size": 4},
     )
     assert RunSpec(**json.loads(json.dumps(run.as_dict()))) == run
-    assert json.loads(json.dumps(run.settings())) == run.settings()
+    assert json.loads(json.dumps(run.settings().as_dict())) == run.settings()
+
+
+def test_settings_from_a_strangers_file_import_nothing(tmp_path, monkeypatch):
+    (tmp_path / "strange.py").write_text("raise SystemExit('imported')")
+    monkeypatch.syspath_prepend(tmp_path)
+    settings = base(callback=["strange.Thing", {"strange.Callback": {"method": "set"}}])
+    assert Settings(settings, imports=False).callback == {"method": "set"}
+    assert Settings(settings, imports=False).method == "set"
+    with pytest.raises(SystemExit, match="imported"):
+        Settings(settings).callback  # noqa: B018
+
+
+def test_settings_keep_what_they_were_made_of():
+    content = base()
+    settings = Settings(content)
+    content["policy_kwargs"]["sparsity"] = 0.1
+    settings.policy_kwargs["sparsity"] = 0.2
+    settings.as_dict()["policy_kwargs"]["sparsity"] = 0.3
+    assert settings["policy_kwargs"]["sparsity"] == 0.9
+    assert settings.replaced(learning_rate=0.3)["learning_rate"] == 0.3
+    assert settings["learning_rate"] == 0.1
+
+
+def test_a_setting_is_found_wherever_it_lies():
+    settings = Settings(base())
+    names = ("sparsity", "update_interval", "learning_rate", "weight_decay", "distribution", "tau")
+    assert [settings.value(name, SAC) for name in names] == [0.9, 7, 0.1, 0.0, "erk", 0.005]
+    assert settings.value("drop_fraction", SAC) == "default"

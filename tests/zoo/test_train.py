@@ -18,9 +18,7 @@ from stable_baselines3.common.monitor import load_results
 from support import ALGORITHMS
 
 from sb3_sparse.errors import ConfigError, CorruptStateError, Diverged, Unwritable
-from sb3_sparse.zoo.checkpoint import last_checkpoint
-from sb3_sparse.zoo.folder import new_run_folder
-from sb3_sparse.zoo.record import read_record, write_record
+from sb3_sparse.zoo.folder import RunFolder
 from sb3_sparse.zoo.replay import BufferSaver, restore_buffer
 from sb3_sparse.zoo.scoring import enjoy
 from sb3_sparse.zoo.spec import RunSpec, algorithms
@@ -133,13 +131,13 @@ def test_a_stopped_run_goes_on_and_evaluates_every_point_once(run, cls, number, 
     assert signal.getsignal(number) == handler
     assert not stopped.finished
     folder = stopped.folder
-    record = read_record(folder)
+    record = RunFolder(folder).record()
     assert record["status"] == "interrupted"
     assert 500 <= record["num_timesteps"] < 700
     cls.load(folder / f"{run.env_id}.zip")
     before = evaluations(folder)
     assert before[0] == [t for t in range(200, 601, 200) if t <= record["num_timesteps"]]
-    checkpoint = last_checkpoint(folder)
+    checkpoint = RunFolder(folder).last_checkpoint()
     saved = cls.load(checkpoint / f"{run.env_id}.zip")
     if cls is DQN:
         restore_buffer(saved.replay_buffer, checkpoint / "replay_buffer")
@@ -167,7 +165,7 @@ def test_a_stopped_run_goes_on_and_evaluates_every_point_once(run, cls, number, 
     episodes = load_results(folder)
     assert len(episodes) > len(monitored)
     assert (episodes["r"][: len(monitored)].values == monitored["r"].values).all()
-    assert read_record(folder)["status"] == "finished"
+    assert RunFolder(folder).record()["status"] == "finished"
     assert not (folder / "resume").exists()
     assert done.model.num_timesteps >= run.n_timesteps
     assert done.model._total_timesteps == run.n_timesteps
@@ -197,9 +195,9 @@ def test_a_second_interrupt_stops_at_once_and_falls_back_to_the_last_evaluation(
     with pytest.raises(KeyboardInterrupt):
         train(DQN_RUN, tmp_path, [Stop(500, times=2)])
     folder = tmp_path / "dqn" / "CartPole-v1_1"
-    assert read_record(folder)["status"] == "running"
-    assert last_checkpoint(folder).name == "400"
-    best = (last_checkpoint(folder) / "best_model.zip").read_bytes()
+    assert RunFolder(folder).record()["status"] == "running"
+    assert RunFolder(folder).last_checkpoint().name == "400"
+    best = (RunFolder(folder).last_checkpoint() / "best_model.zip").read_bytes()
     (folder / "best_model.zip").write_bytes(b"half a file of a later evaluation")
     look = Look()
     outcome = resume(folder, [look])
@@ -214,7 +212,7 @@ def test_a_second_interrupt_stops_at_once_and_falls_back_to_the_last_evaluation(
 def test_a_stop_in_the_last_rollout_leaves_the_last_evaluation_for_later(tmp_path):
     stopped = train(DQN_RUN, tmp_path, [Stop(1000)])
     assert not stopped.finished
-    assert read_record(stopped.folder)["status"] == "evaluating"
+    assert RunFolder(stopped.folder).record()["status"] == "evaluating"
     assert stopped.model.num_timesteps == 1000
     monitored = load_results(stopped.folder)
     assert resume(stopped.folder).finished
@@ -271,7 +269,7 @@ def test_a_run_that_diverges_says_at_which_step_and_keeps_its_last_policy_of_num
     with pytest.raises(Diverged, match="at step 600 there is NaN or infinity in .*learning_rate"):
         train(DQN_RUN, tmp_path, [Poison(450, value)])
     folder = tmp_path / "dqn" / "CartPole-v1_1"
-    record = read_record(folder)
+    record = RunFolder(folder).record()
     assert (record["status"], record["num_timesteps"]) == ("diverged", 600)
     assert record["last_policy"] == 400
     assert "at step 600" in record["error"]
@@ -298,7 +296,7 @@ def test_a_checkpoint_is_never_of_networks_that_diverged(tmp_path):
     with pytest.raises(Diverged, match="at step 400"):
         train(DQN_RUN, tmp_path, [After(-1)])
     folder = tmp_path / "dqn" / "CartPole-v1_1"
-    assert read_record(folder)["last_policy"] == 200
+    assert RunFolder(folder).record()["last_policy"] == 200
     assert evaluations(folder)[0] == [200, 400]
 
 
@@ -306,7 +304,7 @@ def test_networks_that_diverge_after_the_last_evaluation_are_no_finished_run(tmp
     run = replace(DQN_RUN, n_timesteps=1050)
     with pytest.raises(Diverged, match="at step 1050"):
         train(run, tmp_path, [Poison(1020)])
-    assert read_record(tmp_path / "dqn" / "CartPole-v1_1")["last_policy"] == 1000
+    assert RunFolder(tmp_path / "dqn" / "CartPole-v1_1").record()["last_policy"] == 1000
 
 
 def test_what_sb3_raises_of_networks_that_diverged_is_said_to_be_that(tmp_path):
@@ -314,7 +312,7 @@ def test_what_sb3_raises_of_networks_that_diverged_is_said_to_be_that(tmp_path):
     with pytest.raises(Diverged, match="training diverged: at step") as caught:
         train(run, tmp_path)
     assert "no policy was saved before" in str(caught.value)
-    record = read_record(tmp_path / "ppo" / "Pendulum-v1_1")
+    record = RunFolder(tmp_path / "ppo" / "Pendulum-v1_1").record()
     assert (record["status"], record["last_policy"]) == ("diverged", None)
 
 
@@ -325,17 +323,17 @@ def test_an_evaluation_without_a_finite_return_ends_the_run(tmp_path, monkeypatc
     )
     with pytest.raises(Diverged, match="the evaluation at step 200 has the return nan"):
         train(DQN_RUN, tmp_path)
-    assert read_record(tmp_path / "dqn" / "CartPole-v1_1")["status"] == "diverged"
+    assert RunFolder(tmp_path / "dqn" / "CartPole-v1_1").record()["status"] == "diverged"
 
 
 def test_a_run_that_failed_says_so_and_can_go_on(tmp_path):
     with pytest.raises(OSError, match="no space left"):
         train(DQN_RUN, tmp_path, [Break(500)])
     folder = tmp_path / "dqn" / "CartPole-v1_1"
-    record = read_record(folder)
+    record = RunFolder(folder).record()
     assert (record["status"], record["error"]) == ("failed", "OSError: no space left")
     assert resume(folder).finished
-    assert read_record(folder)["error"] is None
+    assert RunFolder(folder).record()["error"] is None
 
 
 def full(*args, **kwargs):
@@ -352,19 +350,19 @@ def test_a_full_disk_says_what_is_kept_and_how_to_go_on(tmp_path, monkeypatch):
     folder = log_folder / "dqn" / "CartPole-v1_1"
     assert f"{folder} cannot be written" in str(caught.value)
     assert f"from step 400: sb3-sparse train --resume '{folder}'" in str(caught.value)
-    record = read_record(folder)
+    record = RunFolder(folder).record()
     assert (record["status"], "No space left" in record["error"]) == ("failed", True)
     assert [path.name for path in (folder / "resume").iterdir()] == ["400"]
     assert resume(folder).finished
 
 
 def test_a_record_that_cannot_be_written_stays_as_it_is(tmp_path, monkeypatch):
-    write_record(tmp_path, status="running", number=1)
+    RunFolder(tmp_path).write(status="running", number=1)
     monkeypatch.setattr(Path, "replace", full)
     with pytest.raises(OSError, match="No space left"):
-        write_record(tmp_path, status="finished")
+        RunFolder(tmp_path).write(status="finished")
     monkeypatch.undo()
-    assert read_record(tmp_path) == {"format": 1, "status": "running", "number": 1}
+    assert RunFolder(tmp_path).record() == {"format": 1, "status": "running", "number": 1}
     assert [path.name for path in tmp_path.iterdir()] == ["sparsity.json"]
 
 
@@ -382,7 +380,7 @@ def test_a_full_disk_under_everything_leaves_the_status_of_a_run_that_was_killed
         train(DQN_RUN, tmp_path, [Fill()])
     monkeypatch.undo()
     folder = tmp_path / "dqn" / "CartPole-v1_1"
-    assert read_record(folder)["status"] == "running"
+    assert RunFolder(folder).record()["status"] == "running"
     DQN.load(folder / "best_model.zip")
     assert evaluations(folder)[0] == [200, 400]  # as before the disk was full
     assert resume(folder).finished
@@ -439,24 +437,24 @@ def test_while_a_run_is_pruned_there_is_no_best(tmp_path):
 
 def test_a_checkpoint_that_cannot_be_read_is_named(tmp_path):
     stopped = train(DQN_RUN, tmp_path, [Stop(500)])
-    (last_checkpoint(stopped.folder) / "CartPole-v1.zip").write_bytes(b"")
+    (RunFolder(stopped.folder).last_checkpoint() / "CartPole-v1.zip").write_bytes(b"")
     with pytest.raises(CorruptStateError, match=r"resume/500/CartPole-v1.zip is damaged"):
         resume(stopped.folder)
 
 
 def test_a_run_whose_buffer_is_not_whole_goes_on_with_none_only_when_told(tmp_path):
     stopped = train(DQN_RUN, tmp_path, [Stop(500)])
-    buffer = last_checkpoint(stopped.folder) / "replay_buffer"
+    buffer = RunFolder(stopped.folder).last_checkpoint() / "replay_buffer"
     (buffer / "0.npz").unlink()
     with pytest.raises(ConfigError, match="0.npz is missing. Restore it from a copy, or delete"):
         resume(stopped.folder)
-    assert read_record(stopped.folder)["status"] == "interrupted"
+    assert RunFolder(stopped.folder).record()["status"] == "interrupted"
     shutil.rmtree(buffer)
     with pytest.warns(UserWarning, match="goes on with an empty one"):
         done = resume(stopped.folder)
     assert done.finished
     assert done.model.replay_buffer.size() == 500  # of 1000
-    assert read_record(stopped.folder)["without_buffer_from"] == 500
+    assert RunFolder(stopped.folder).record()["without_buffer_from"] == 500
 
 
 def test_an_environment_that_breaks_loses_nothing_of_a_trained_run(tmp_path, monkeypatch):
@@ -468,7 +466,7 @@ def test_an_environment_that_breaks_loses_nothing_of_a_trained_run(tmp_path, mon
         train(DQN_RUN, tmp_path)
     folder = tmp_path / "dqn" / "CartPole-v1_1"
     for _ in range(2):
-        assert read_record(folder)["status"] == "failed"
+        assert RunFolder(folder).record()["status"] == "failed"
         with pytest.raises(RuntimeError, match="no simulator"):
             resume(folder)
     monkeypatch.undo()
@@ -492,14 +490,14 @@ def test_a_device_that_is_not_there_is_refused(tmp_path):
         with pytest.raises(ConfigError, match=f"no device '{device}' here; give --device auto or"):
             train(replace(DQN_RUN, device=device), tmp_path)
     assert train(replace(DQN_RUN, n_timesteps=100), tmp_path).model.device.type == "cpu"
-    assert read_record(tmp_path / "dqn" / "CartPole-v1_1")["device"] == "cpu"
+    assert RunFolder(tmp_path / "dqn" / "CartPole-v1_1").record()["device"] == "cpu"
 
 
 def test_a_run_that_died_before_its_first_evaluation_starts_again(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         train(DQN_RUN, tmp_path, [Stop(100, times=2)])
     folder = tmp_path / "dqn" / "CartPole-v1_1"
-    assert last_checkpoint(folder) is None
+    assert RunFolder(folder).last_checkpoint() is None
     assert resume(folder).finished
     assert evaluations(folder)[0] == [200, 400, 600, 800, 1000]
 
@@ -524,7 +522,7 @@ def test_a_checkpoint_half_written_is_not_one(tmp_path):
         train(DQN_RUN, tmp_path, [Stop(500, times=2)])
     folder = tmp_path / "dqn" / "CartPole-v1_1"
     (folder / "resume" / "unfinished").mkdir()
-    assert last_checkpoint(folder).name == "400"
+    assert RunFolder(folder).last_checkpoint().name == "400"
     assert resume(folder).finished
 
 
@@ -553,7 +551,7 @@ def test_masks_move_after_a_resume_as_the_schedule_says(tmp_path):
 def test_a_dense_run_of_equal_parameters_says_what_it_reached(tmp_path):
     run, seen = RunSpec(method="dense", match_params=0.9, n_timesteps=200, **QUICK), Seen()
     outcome = train(run, tmp_path, watch=seen)
-    record = read_record(outcome.folder)
+    record = RunFolder(outcome.folder).record()
     match = record["match"]
     assert match["target"] == (2048 + 23451 + 1024) + 512 + 512 + 2  # the vector of 4-512-512-2
     width, _ = outcome.model.policy.net_arch
@@ -616,9 +614,9 @@ def test_enjoy_scores_last_and_best_with_the_runs_normalization(tmp_path):
 def test_folders_are_numbered_on_and_never_shared(tmp_path):
     (tmp_path / "A-v1_7").mkdir()
     (tmp_path / "A-v1_old").mkdir()
-    assert new_run_folder(tmp_path, "A-v1").name == "A-v1_8"
-    assert new_run_folder(tmp_path, "A-v1").name == "A-v1_9"
-    assert new_run_folder(tmp_path, "B-v1").name == "B-v1_1"
+    assert RunFolder.new(tmp_path.parent, tmp_path.name, "A-v1").path.name == "A-v1_8"
+    assert RunFolder.new(tmp_path.parent, tmp_path.name, "A-v1").path.name == "A-v1_9"
+    assert RunFolder.new(tmp_path.parent, tmp_path.name, "B-v1").path.name == "B-v1_1"
 
 
 def test_the_algorithms_are_those_with_a_sparse_policy():
@@ -663,7 +661,7 @@ def test_an_atari_run_stacks_frames_resumes_and_is_filmed(tmp_path, monkeypatch)
     outcome = resume(stopped.folder)
     assert outcome.model.observation_space.shape == (4, 84, 84)
     assert evaluations(outcome.folder)[0] == [30, 60]
-    assert read_record(outcome.folder)["layers"][0]["shape"] == [2, 4, 3, 3]
+    assert RunFolder(outcome.folder).record()["layers"][0]["shape"] == [2, 4, 3, 3]
     score = enjoy(outcome.folder, episodes=1, video=True)
     assert -21 <= score.mean_return <= 21
     (video,) = score.videos
