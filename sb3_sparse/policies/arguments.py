@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Iterable
 from functools import cache
 from importlib import import_module
 from typing import Any
 
-from sb3_sparse.errors import ConfigError, did_you_mean
+from sb3_sparse.errors import ConfigError
 
 CLASSES = ("features_extractor_class", "optimizer_class", "activation_fn")
 
@@ -60,17 +59,3 @@ def arguments_of(cls: type) -> frozenset[str]:
             break
     given = "self args kwargs env observation_space action_space lr_schedule _init_setup_model"
     return frozenset(names - {*given.split()})
-
-
-def check_arguments(policy: type, given: Iterable[str]) -> None:
-    """Check names of keyword arguments.
-
-    :raises ConfigError: for one that the policy class does not take
-    """
-    known = arguments_of(policy)
-    for name in given:
-        if name not in known:
-            raise ConfigError(
-                f"{policy.__name__} has no argument {name!r}{did_you_mean(name, known)}; it takes "
-                f"{', '.join(sorted(known))}"
-            )

@@ -17,8 +17,8 @@ from sb3_sparse.engine.controller import Controller
 from sb3_sparse.engine.linear import check_conversion
 from sb3_sparse.engine.optimizers import check_weight_decay, prefer_fused
 from sb3_sparse.engine.places import check_places
-from sb3_sparse.errors import CorruptStateError, UnsupportedError
-from sb3_sparse.policies.arguments import check_arguments, import_classes
+from sb3_sparse.errors import CorruptStateError, UnsupportedError, check_choice
+from sb3_sparse.policies.arguments import arguments_of, import_classes
 from sb3_sparse.policies.build import build_networks
 from sb3_sparse.policies.compiled import names_in, plain_names
 from sb3_sparse.policies.config import SparsityConfig
@@ -93,7 +93,9 @@ class BaseSparsePolicy(DenseVectors, FastPredict):
                 "without gradients, such as ARS, have no sparse policy; "
                 "sb3_sparse.supported_algorithms() lists those that have one"
             )
-        check_arguments(type(self), kwargs)
+        known = sorted(arguments_of(type(self)))
+        for name in kwargs:
+            check_choice(f"argument of {type(self).__name__}", name, known)
         config = SparsityConfig.pop_from(kwargs)
         import_classes(kwargs)
         weight_decay = check_weight_decay(config.weight_decay, kwargs.get("optimizer_kwargs"))

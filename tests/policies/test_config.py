@@ -41,7 +41,9 @@ def test_a_policy_without_sparsity_does_not_train_dense():
 
 
 def test_a_mistyped_argument_is_named_with_the_nearest_one():
-    with pytest.raises(ConfigError, match="has no argument 'spasity' .did you mean 'sparsity'.*"):
+    with pytest.raises(
+        ConfigError, match="unknown argument of SparseSACPolicy 'spasity' .did you mean 'sparsity'"
+    ):
         make("SAC", policy="SparsePolicy", policy_kwargs=dict(spasity=0.9))
     with pytest.raises(ConfigError, match="'net_arc' .did you mean 'net_arch'"):
         make("SAC", policy_kwargs=dict(net_arc=[8]))
