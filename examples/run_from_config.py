@@ -6,8 +6,7 @@ python examples/run_from_config.py
 import argparse
 from pathlib import Path
 
-from sb3_sparse.zoo.spec import RunSpec
-from sb3_sparse.zoo.training import train
+from sb3_sparse.zoo import RunSpec, train
 
 
 def main() -> None:

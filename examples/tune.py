@@ -11,7 +11,7 @@ from pathlib import Path
 import optuna
 
 from sb3_sparse.tuning import Objective, Space, open_storage, tune, write_report
-from sb3_sparse.zoo.spec import RunSpec
+from sb3_sparse.zoo import RunSpec
 
 choices = optuna.distributions.CategoricalDistribution
 

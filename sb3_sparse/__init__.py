@@ -12,7 +12,6 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sb3_sparse.algorithms.table import HOMES
 from sb3_sparse.lazy import lazily
 from sb3_sparse.policies.registry import (
     CONTRIB,
@@ -32,6 +31,11 @@ if TYPE_CHECKING:
     from sb3_sparse.compress.twin import sparsify
     from sb3_sparse.policies.actor_critic import SparseActorCriticPolicy
     from sb3_sparse.policies.base import BaseSparsePolicy
+    from sb3_sparse.policies.contrib import (
+        SparseCrossQPolicy,
+        SparseQRDQNPolicy,
+        SparseTQCPolicy,
+    )
     from sb3_sparse.policies.dqn import SparseDQNPolicy
     from sb3_sparse.policies.sac import SparseSACPolicy
     from sb3_sparse.policies.spec import NetworkSpec, PassCounts
@@ -58,24 +62,10 @@ __all__ = [
     "sparsify",
     "supported_algorithms",
 ]
-_CONTRIB = ["SparseCrossQPolicy", "SparseQRDQNPolicy", "SparseTQCPolicy"]
 if find_spec("sb3_contrib"):
-    __all__ += _CONTRIB
+    __all__ += ["SparseCrossQPolicy", "SparseQRDQNPolicy", "SparseTQCPolicy"]
 __getattr__, __dir__ = lazily(
     __name__,
-    {
-        **{name: f"algorithms.{home}" for name, home in HOMES.items()},
-        "BaseSparsePolicy": "policies.base",
-        "NetworkSpec": "policies.spec",
-        "PassCounts": "policies.spec",
-        "SparseActorCriticPolicy": "policies.actor_critic",
-        "SparseDQNPolicy": "policies.dqn",
-        "SparseSACPolicy": "policies.sac",
-        "SparseTD3Policy": "policies.td3",
-        "SparsityCallback": "callback",
-        "sparsify": "compress.twin",
-        **dict.fromkeys(_CONTRIB, "policies.contrib"),
-    },
     {
         name: f"sb3_sparse has no {name} of its own: sb3_contrib.{name} takes SparsePolicy, and "
         "trains it in SB3's own gradient steps"

@@ -2,31 +2,41 @@
 
 from __future__ import annotations
 
+import ast
 import sys
 from collections.abc import Callable, Mapping
 from importlib import import_module
+from inspect import getsource
 from typing import Any
 
 
 def lazily(
-    package: str, homes: Mapping[str, str], absent: Mapping[str, str] | None = None
+    package: str, absent: Mapping[str, str] | None = None
 ) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
     """``__getattr__`` and ``__dir__`` of a package that imports its modules as they are needed.
 
-    So a light module in it, one that knows names for instance, can be imported without those that
-    need torch. No name may be that of a module in the package: which of the two it is would depend
-    on what was imported before.
+    So you can import a light module in it, one that knows names for instance, without those that
+    need torch. What the package imports ``if TYPE_CHECKING`` are the names, and where they are. No
+    name may be that of a module in the package: which of the two it is would depend on what was
+    imported before.
 
     :param package: its ``__name__``
-    :param homes: the module of each name, relative to the package, e.g. ``{"Study": "spec"}``
     :param absent: what to say of names that the package might be expected to have
     """
+    homes = {
+        alias.name: node.module
+        for block in ast.parse(getsource(sys.modules[package])).body
+        if isinstance(block, ast.If) and ast.unparse(block.test) == "TYPE_CHECKING"
+        for node in block.body
+        if isinstance(node, ast.ImportFrom) and node.module is not None
+        for alias in node.names
+    }
 
     def getattr_(name: str) -> Any:
         if name not in homes:
             usual = f"module {package!r} has no attribute {name!r}"
             raise AttributeError((absent or {}).get(name, usual))
-        return getattr(import_module(f"{package}.{homes[name]}"), name)
+        return getattr(import_module(homes[name]), name)
 
     def dir_() -> list[str]:
         module = sys.modules[package]

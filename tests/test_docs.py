@@ -37,19 +37,6 @@ DOORS += [".sparsity", ".studies", ".topology", ".tuning", ".zoo"]
 WITHOUT_EXAMPLE: set[str] = {
     "sb3_sparse.report.LeftOut",
     "sb3_sparse.report.RunData",
-    "sb3_sparse.studies.CellState",
-    "sb3_sparse.studies.CellStatus",
-    "sb3_sparse.studies.Progress",
-    "sb3_sparse.studies.Study",
-    "sb3_sparse.zoo.Archive",
-    "sb3_sparse.zoo.Archived",
-    "sb3_sparse.zoo.Inspection",
-    "sb3_sparse.zoo.Outcome",
-    "sb3_sparse.zoo.Record",
-    "sb3_sparse.zoo.Result",
-    "sb3_sparse.zoo.Score",
-    "sb3_sparse.zoo.Status",
-    "sb3_sparse.zoo.Watch",
 }
 """Public classes whose docstring has no example yet."""
 

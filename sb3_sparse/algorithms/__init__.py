@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from sb3_sparse.algorithms.table import HOMES
 from sb3_sparse.lazy import lazily
 
 if TYPE_CHECKING:
@@ -19,4 +18,4 @@ if TYPE_CHECKING:
     from sb3_sparse.algorithms.training import parts
 
 __all__ = ["A2C", "DDPG", "DQN", "PPO", "SAC", "TD3", "parts"]
-__getattr__, __dir__ = lazily(__name__, {**HOMES, "parts": "training"})
+__getattr__, __dir__ = lazily(__name__)

@@ -8,19 +8,15 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:  # which is imported when an algorithm is, not when one is named
     from stable_baselines3.common.base_class import BaseAlgorithm
 
-HOMES = {"A2C": "a2c", "DDPG": "td3", "DQN": "dqn", "PPO": "ppo", "SAC": "sac", "TD3": "td3"}
-"""The module of each algorithm that this package has a class for."""
-
 
 def algorithm_named(name: str) -> type[BaseAlgorithm]:
     """Find the class of an algorithm: this package's if it has one, else sb3-contrib's.
 
     :param name: one of :func:`~sb3_sparse.policies.registry.algorithm_names`
     """
-    if name in HOMES:
-        found: type[BaseAlgorithm] = getattr(
-            import_module(f"sb3_sparse.algorithms.{HOMES[name]}"), name
-        )
+    own = import_module("sb3_sparse.algorithms")
+    if name in own.__all__:
+        found: type[BaseAlgorithm] = getattr(own, name)
         return found
     from sb3_sparse.policies.registry import supported_algorithms
 

@@ -20,14 +20,4 @@ __all__ = [
     "export_policy",
     "record_observations",
 ]
-__getattr__, __dir__ = lazily(
-    __name__,
-    {
-        "FORMATS": "formats",
-        "ExportReport": "write",
-        "Parity": "parity",
-        "ParityError": "parity",
-        "export_policy": "write",
-        "record_observations": "observations",
-    },
-)
+__getattr__, __dir__ = lazily(__name__)

@@ -10,18 +10,7 @@ if TYPE_CHECKING:
     from sb3_sparse.studies.blocks import study_names
     from sb3_sparse.studies.runner import Progress, run_study
     from sb3_sparse.studies.spec import Study
-    from sb3_sparse.studies.status import CellState, CellStatus, status_of
+    from sb3_sparse.studies.status import CellStatus, status_of
 
-__all__ = ["CellState", "CellStatus", "Progress", "Study", "run_study", "status_of", "study_names"]
-__getattr__, __dir__ = lazily(
-    __name__,
-    {
-        "CellState": "status",
-        "CellStatus": "status",
-        "Progress": "runner",
-        "Study": "spec",
-        "run_study": "runner",
-        "status_of": "status",
-        "study_names": "blocks",
-    },
-)
+__all__ = ["CellStatus", "Progress", "Study", "run_study", "status_of", "study_names"]
+__getattr__, __dir__ = lazily(__name__)

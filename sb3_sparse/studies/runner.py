@@ -20,7 +20,19 @@ FUNCTION = "sb3_sparse.studies.worker:work_on"
 
 @dataclass
 class Progress:
-    """How far a study is.
+    """How far a study is. :func:`run_study` yields it.
+
+    Example::
+
+        from pathlib import Path
+        from sb3_sparse.launch import launcher_named
+        from sb3_sparse.studies import Study, run_study
+
+        study = Study.read("flops", "smoke")
+        steps = run_study(study, Path("studies"), launcher_named("local"), workers=1)
+        progress = next(steps)
+        steps.close()  # the next call continues
+        print(progress.done, "of", progress.planned)
 
     :param planned: its cells
     :param done: cells that are done, before this start too

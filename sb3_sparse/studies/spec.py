@@ -39,6 +39,13 @@ from sb3_sparse.zoo.spec import RunSpec
 class Study:
     """What is trained, at one scale, and what is drawn of it.
 
+    Example::
+
+        from sb3_sparse.studies import Study
+
+        study = Study.read("classic_control", "smoke")
+        print(study.title, len(study.cells), study.cells[0].name)
+
     :param name: of the file
     :param scale: one of its file's, e.g. ``"small"``
     :param title: for its report

@@ -42,6 +42,15 @@ class CellState(str, Enum):
 class CellStatus:
     """A cell and how far it is.
 
+    Example::
+
+        from pathlib import Path
+        from sb3_sparse.studies import Study, status_of
+
+        study = Study.read("classic_control", "smoke")
+        status = status_of(study.cells[0], Path("studies"))
+        print(status.state, status.steps)
+
     :param cell: which
     :param folder: its run's folder, there or not
     :param state: how far it is
@@ -60,14 +69,6 @@ class CellStatus:
 
 def status_of(cell: Cell, store: Path, lines: Lines | None = None) -> CellStatus:
     """How far a cell is. A line in the archive counts before what lies in its folder.
-
-    Example::
-
-        from pathlib import Path
-        from sb3_sparse.studies import Study, status_of
-
-        study = Study.read("classic_control", "smoke")
-        print({status_of(cell, Path("studies")).state for cell in study.cells})
 
     :param store: folder of the studies' runs
     :param lines: of the archive

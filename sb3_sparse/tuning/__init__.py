@@ -26,17 +26,4 @@ __all__ = [
     "wide_space",
     "write_report",
 ]
-__getattr__, __dir__ = lazily(
-    __name__,
-    {
-        "Objective": "objective",
-        "Space": "spaces",
-        "Tuned": "tuner",
-        "open_storage": "storage",
-        "paper_space": "shipped",
-        "space_of": "spacefile",
-        "tune": "tuner",
-        "wide_space": "shipped",
-        "write_report": "report",
-    },
-)
+__getattr__, __dir__ = lazily(__name__)

@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING
 from sb3_sparse.lazy import lazily
 
 if TYPE_CHECKING:
-    from sb3_sparse.zoo.archive import Archive, Archived
+    from sb3_sparse.zoo.archive import Archive
     from sb3_sparse.zoo.configs import config_path
     from sb3_sparse.zoo.folder import RunFolder
-    from sb3_sparse.zoo.inspection import Inspection, inspect_model
+    from sb3_sparse.zoo.inspection import inspect_model
     from sb3_sparse.zoo.record import Record, Status
-    from sb3_sparse.zoo.results import Outcome, Result
+    from sb3_sparse.zoo.results import Outcome
     from sb3_sparse.zoo.saved import SavedModel
-    from sb3_sparse.zoo.scoring import Score, enjoy
+    from sb3_sparse.zoo.scoring import enjoy
     from sb3_sparse.zoo.settings import Settings
     from sb3_sparse.zoo.spec import RunSpec
     from sb3_sparse.zoo.training import resume, train
@@ -22,15 +22,11 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Archive",
-    "Archived",
-    "Inspection",
     "Outcome",
     "Record",
-    "Result",
     "RunFolder",
     "RunSpec",
     "SavedModel",
-    "Score",
     "Settings",
     "Status",
     "Watch",
@@ -40,26 +36,4 @@ __all__ = [
     "resume",
     "train",
 ]
-__getattr__, __dir__ = lazily(
-    __name__,
-    {
-        "Archive": "archive",
-        "Archived": "archive",
-        "Inspection": "inspection",
-        "Outcome": "results",
-        "Record": "record",
-        "Result": "results",
-        "RunFolder": "folder",
-        "RunSpec": "spec",
-        "SavedModel": "saved",
-        "Score": "scoring",
-        "Settings": "settings",
-        "Status": "record",
-        "Watch": "watch",
-        "config_path": "configs",
-        "enjoy": "scoring",
-        "inspect_model": "inspection",
-        "resume": "training",
-        "train": "training",
-    },
-)
+__getattr__, __dir__ = lazily(__name__)

@@ -52,7 +52,9 @@ class Archived:
     measured: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
-    def of_folder(cls, folder: RunFolder, address: str, files: Iterable[str]) -> Archived:
+    def of_folder(
+        cls, folder: RunFolder, address: str, files: Iterable[str] = ()
+    ) -> Archived:
         """Read a run's folder.
 
         :param files: names of the files of measurements that it may have
@@ -126,7 +128,19 @@ class Archived:
 
 
 class Archive:
-    """A file of lines. Processes may read it and append to it at once.
+    """A JSON-lines file with a line for each run. Processes may read it and append to it at once.
+
+    Example::
+
+        from pathlib import Path
+        from sb3_sparse.zoo import Archive, RunFolder, RunSpec, train
+        from sb3_sparse.zoo.archive import Archived
+
+        outcome = train(RunSpec(n_timesteps=200, eval_freq=100, eval_episodes=1))
+        archive = Archive(Path("runs.jsonl"))
+        archive.add([Archived.of_folder(RunFolder(outcome.folder), "my-run")])
+        (run,) = archive.read()["my-run"]
+        print(run.record["total"]["sparsity"], run.returns.mean(axis=1))
 
     :param path: of the file; it need not exist yet
     """

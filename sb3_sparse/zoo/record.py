@@ -34,7 +34,14 @@ PACKAGES = (
 
 
 class Status(str, Enum):
-    """How far a run is."""
+    """How far a run is. A text too: ``Status.RUNNING == "running"``.
+
+    Example::
+
+        from sb3_sparse.zoo import Status
+
+        print([str(status) for status in Status if status.is_over])
+    """
 
     RUNNING = "running"
     """It trains, or was killed while it did."""
@@ -64,6 +71,13 @@ class Record(Mapping[str, Any]):
     """The content of a run's ``sparsity.json``, or of its line in an archive.
 
     A mapping of all that the file holds. The properties check what they return.
+
+    Example::
+
+        from sb3_sparse.zoo import Record
+
+        record = Record({"status": "finished", "num_timesteps": 100_000})
+        print(record.status.is_over, record.num_timesteps)
 
     :param content: the file's mapping
     :param source: the file, for messages

@@ -47,6 +47,14 @@ class Result:
 class Outcome:
     """How a run ended.
 
+    Example::
+
+        from sb3_sparse.zoo import RunSpec, train
+
+        outcome = train(RunSpec(n_timesteps=200, eval_freq=100, eval_episodes=1))
+        if outcome.finished:
+            print(outcome.results[0].mean_return, "at sparsity", outcome.sparsity)
+
     :param folder: the run's folder
     :param model: as it is now
     :param results: of the last policy and the best one; empty if the run was stopped before its end

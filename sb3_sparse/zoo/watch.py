@@ -20,7 +20,19 @@ from sb3_sparse.zoo.match import Match
 
 
 class Watch(BaseCallback):
-    """A callback that is also told what happens outside training; this one does nothing."""
+    """A callback that is also told what happens outside training; this one does nothing.
+
+    Example::
+
+        from sb3_sparse.zoo import RunSpec, Watch, train
+
+        class Evaluations(Watch):
+            def evaluated(self, step, mean, std, best):
+                print(f"step {step}: {mean:.1f}")
+
+        run = RunSpec(n_timesteps=200, eval_freq=100, eval_episodes=1)
+        train(run, watch=Evaluations())
+    """
 
     def begins(self, folder: Path, match: Match | None) -> None:
         """A run has its folder and its settings; from here on it can be resumed.
