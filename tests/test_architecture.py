@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ast
+import re
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -145,3 +147,62 @@ def test_the_package_is_typed_and_versioned_once():
 
     assert (PACKAGE / "py.typed").exists()
     assert f'version = "{sb3_sparse.__version__}"' in (ROOT / "pyproject.toml").read_text()
+
+
+# What documents and examples may import from; everything else is free to move.
+DOORS = {
+    "",
+    "algorithms",
+    "analysis",
+    "compress",
+    "export",
+    "fused",
+    "networks",
+    "report",
+    "sparsity",
+    "studies",
+    "topology",
+    "tuning",
+    "wrappers",
+    "zoo",
+}
+MODULES = {"rl_zoo_optimize"}  # which --gym-packages names
+
+
+def names_used(text: str) -> set[str]:
+    """Dotted names of this package that a document or script uses."""
+    found = set(re.findall(r"\bsb3_sparse(?:\.\w+)+", text))
+    for module, names in re.findall(
+        r"^\s*from (sb3_sparse[\w.]*) import (\([^)]*\)|[^\n]*)", text, re.MULTILINE
+    ):
+        found.discard(module)
+        found.update(f"{module}.{name}" for name in re.findall(r"\w+", names))
+    return found
+
+
+def is_public(name: str) -> bool:
+    _, *path, last = name.split(".")
+    door = ".".join(path)
+    if door == "" and last in DOORS | MODULES:
+        return True
+    if door not in DOORS:  # an attribute of a public class
+        return is_public(f"sb3_sparse.{door}")
+    return last in getattr(import_module(f"sb3_sparse.{door}".rstrip(".")), "__all__", ())
+
+
+DOCUMENTS = [ROOT / "README.md", *(ROOT / "docs").glob("*.md"), *(ROOT / "examples").glob("*.py")]
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.name)
+def test_documents_use_public_doors_alone(path):
+    assert [name for name in sorted(names_used(path.read_text())) if not is_public(name)] == []
+
+
+def test_the_checker_sees_a_name_behind_a_door():
+    text = "from sb3_sparse.zoo.spec import (\n    RunSpec,\n)\nsb3_sparse.zoo.train(run)\n"
+    assert names_used(text) == {"sb3_sparse.zoo.spec.RunSpec", "sb3_sparse.zoo.train"}
+    assert not is_public("sb3_sparse.zoo.spec.RunSpec")
+    assert not is_public("sb3_sparse.zoo.spec")
+    assert not is_public("sb3_sparse.zoo.spec.RunSpec.settings")
+    assert is_public("sb3_sparse.zoo.train")
+    assert is_public("sb3_sparse.zoo.RunSpec.settings")
