@@ -1,15 +1,15 @@
-"""Whether a run's record has all that figures rely on, and is of what it says."""
+"""Checks that a run's record is complete, and that the run is as sparse as its settings say."""
 
 from __future__ import annotations
 
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.zoo.record import NAME, Record, Status
 
-NEAR = 0.01  # of the connections; what rounding and schedules differ by is far less
+NEAR = 0.01  # of the connections; rounding and schedules make far less of a difference
 
 
 def check_complete(record: Record) -> None:
-    """Refuse a run that is not over, or a record that lacks a part.
+    """Check that a run has ended and that its record lacks nothing.
 
     :raises ConfigError: with the status or the missing part
     """
@@ -28,11 +28,11 @@ def check_complete(record: Record) -> None:
 
 
 def check_reached(record: Record) -> None:
-    """Refuse a run whose networks are not as sparse as its settings say.
+    """Check that a run's networks are as sparse as its settings say.
 
-    Runs of before ``wanted_nnz`` was recorded can only have stayed too dense after a denser start.
+    Older records lack ``wanted_nnz``; only runs with a denser start can have stayed too dense.
 
-    :raises ConfigError: with what it reached and what it was to reach
+    :raises ConfigError: with the sparsity that it reached and the one that it should have reached
     """
     total, kwargs = record["total"], record.settings["policy_kwargs"]
     reached, asked = float(total["sparsity"]), kwargs.get("sparsity")

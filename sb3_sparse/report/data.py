@@ -1,4 +1,4 @@
-"""Run folders and archived runs; what cannot be read is named with its reason, never averaged."""
+"""Runs, read from folders and archives; unreadable ones are named with a reason, never averaged."""
 
 from __future__ import annotations
 
@@ -38,11 +38,19 @@ MEASURED = {
 
 @dataclass(frozen=True)
 class LeftOut:
-    """Something that is not in the report.
+    """A run, or a file of one, that is not in the report.
 
     :param folder: the run's folder
-    :param reason: why
-    :param diverged: whether its training ended in NaN
+    :param reason: why it is left out
+    :param diverged: whether the run's training ended in NaN
+
+    Example::
+
+        from sb3_sparse.report import read_runs
+
+        runs, left_out = read_runs(["logs/dqn/CartPole-v1_1"])
+        for one in left_out:
+            print(one.folder, one.reason)
     """
 
     folder: Path
@@ -56,13 +64,22 @@ class _DivergedRun(ConfigError):
 
 @dataclass(frozen=True, eq=False)
 class RunData:
-    """What a run folder says of its run.
+    """A run, as its folder describes it.
 
     :param folder: where it was read
     :param record: content of ``sparsity.json``
     :param timesteps: environment steps of each evaluation, shape ``[T]``; empty if never trained
     :param returns: mean episode return of each evaluation, shape ``[T]``
-    :param measured: rows of the other files, by file name; only those that are there
+    :param measured: rows of the files of measurements that exist, by file name
+
+    Example::
+
+        from sb3_sparse.report import read_runs
+        from sb3_sparse.zoo import RunSpec, train
+
+        train(RunSpec("dqn", "CartPole-v1", method="static", n_timesteps=200, eval_freq=100))
+        (run,), left_out = read_runs(["logs/dqn/CartPole-v1_1"])
+        print(run.env_id, run.label, run.level, run.score)
     """
 
     folder: Path
@@ -94,26 +111,26 @@ class RunData:
 
     @property
     def steps(self) -> int:
-        """Environment steps asked for."""
+        """The number of environment steps that its settings ask for."""
         return int(self.settings.get("n_timesteps", 0))
 
     @cached_property
     def family(self) -> str:
-        """Algorithm, architecture and suite: what is compared with one another."""
+        """Algorithm, architecture and suite; runs of one family are compared."""
         extractor = str(self.settings["policy_kwargs"].get("features_extractor_class", ""))
         resnet = " with the Impala ResNet" if "impala" in extractor.lower() else ""
         return f"{self.algo.upper()}{resnet} on {suite_of(self.env_id)}"
 
     @cached_property
     def label(self) -> str:
-        """Method; a dense network of fewer parameters has a label of its own."""
+        """The method; a dense network that matches a sparse one has a label of its own."""
         method = str(self.record["method"])
         small = self.record["run"].get("match_params") is not None
         return EQUAL if method == DENSE and small else method
 
     @cached_property
     def level(self) -> float:
-        """Removed fraction of the network, or that whose parameter count a dense one matches."""
+        """The sparsity; for a dense network that matches a sparse one, the sparsity of that one."""
         matched = self.record["run"].get("match_params")
         if matched is not None:
             return float(matched)
@@ -126,27 +143,27 @@ class RunData:
 
     @cached_property
     def score(self) -> float:
-        """Mean over the last 10 % of the evaluations."""
+        """The mean over the last 10 % of the evaluations."""
         return score_of([float(value) for value in self.returns])
 
     @property
     def parameters(self) -> int:
-        """Active weights and biases."""
+        """The number of active weights and biases."""
         return int(self.record["total"]["parameters"])
 
     @property
     def connections(self) -> int:
-        """Active weights."""
+        """The number of active weights."""
         return sum(int(layer["nnz"]) for layer in self.layers)
 
     @property
     def flops(self) -> int:
-        """Of one forward pass of all networks, for one observation."""
+        """The FLOPs of a forward pass of all networks, for one observation."""
         return int(self.record["total"]["flops"])
 
     @property
     def dense_flops(self) -> int:
-        """The same, were every connection there."""
+        """The FLOPs of the same pass if every connection were active."""
         return int(self.record["total"]["dense_flops"])
 
     @property
@@ -155,7 +172,7 @@ class RunData:
 
     @cached_property
     def actor_share(self) -> float | None:
-        """Fraction of all connections that the actor has; None without an actor."""
+        """The actor's fraction of all active weights; None without an actor."""
         counts: dict[str, int] = {}
         for layer in self.layers:
             counts[layer["network"]] = counts.get(layer["network"], 0) + int(layer["nnz"])
@@ -163,7 +180,7 @@ class RunData:
         return counts["actor"] / total if len(counts) > 1 and counts.get("actor") else None
 
     def variant(self, *without: str) -> str:
-        """Its settings but for method and sparsity, as one comparable text.
+        """Return its settings without method and sparsity, as a text to compare.
 
         :param without: names of more settings that may differ
         """
@@ -171,7 +188,7 @@ class RunData:
 
     @property
     def changes(self) -> int:
-        """How many settings the run changes in its config."""
+        """The number of settings of its config that the run changes."""
         run = self.record["run"]
         others = sum(run.get(name) is not None for name in ("distribution", "conf_file", "entry"))
         return len(run.get("hyperparams") or {}) + others
@@ -182,10 +199,11 @@ def read_runs(
 ) -> tuple[list[RunData], list[LeftOut]]:
     """Read run folders, and runs of an archive.
 
-    :param folders: each the folder of one run, e.g. ``logs/dqn/CartPole-v1_1``
-    :param archived: runs by the folder that they have or had, which goes before what is in it
+    :param folders: folders of single runs, e.g. ``logs/dqn/CartPole-v1_1``
+    :param archived: archived runs by the folder that they have or had; they take precedence over
+        the folder's content
     :return: finished and counted runs in a fixed order, and what was left out. Of two runs with the
-        same settings and seed the first in the order of folders stays
+        same settings and seed, the first in the order of folders stays
     """
     runs: list[RunData] = []
     out: list[LeftOut] = []
@@ -235,7 +253,7 @@ def _read(folder: Path, archived: Archived | None) -> tuple[RunData, list[str]]:
             if text is not None:
                 measured[name] = rows_of(text, folder / name, columns)
         except SparsityError as error:
-            remarks.append(f"only its {name}: {error}; all else of the run is in")
+            remarks.append(f"only its {name}: {error}; the rest of the run is in")
     run = RunData(folder, record, timesteps, returns, measured)
     with record.reading():
         _try_out(run)
@@ -243,32 +261,34 @@ def _read(folder: Path, archived: Archived | None) -> tuple[RunData, list[str]]:
 
 
 def _measured_text(path: Path, archived: Archived | None) -> str | None:
-    """Text of a file of measurements; None if the run has none."""
+    """Return the text of a file of measurements; None if the run has none."""
     if archived is not None:
         return archived.measured.get(path.name)
     return measured_text(path) if path.is_file() else None
 
 
 def _divergence(run: RunData) -> str:
-    """What diverged and when, in one line."""
+    """Describe what diverged and when, in one line."""
     level = "" if run.label == DENSE else f" {run.level:.0%}"
     which = f"{run.algo.upper()} on {run.env_id}, {run.label}{level}, seed {run.seed}"
     return f"{which}: {run.record.get('error') or 'training diverged, no step is recorded'}"
 
 
 def _try_out(run: RunData) -> None:
-    """Ask a run everything that a report will, so that a wrong type comes out here."""
+    """Read everything that a report reads, so that a wrong type shows here."""
     numbers = [run.seed, run.steps, run.level, run.parameters, run.connections, run.flops]
     numbers += [run.dense_flops, run.actor_share or 0.0, run.score if run.trained else 0.0]
     if not all(map(math.isfinite, numbers)):
         raise CorruptStateError(f"{run.folder / NAME} is damaged: a number in it is not finite")
-    names = (run.algo, run.env_id, run.family, run.label)
     for layer in run.layers:
         if not all(type(size) is int and size > 0 for size in layer["shape"]):
             raise CorruptStateError(
                 f"{run.folder / NAME} is damaged: {layer['name']} has shape {layer['shape']!r}"
             )
-    _identity(run), run.variant(), run.changes, names
+    for read in (_identity, RunData.variant):
+        read(run)
+    for name in ("algo", "env_id", "family", "label", "changes"):
+        getattr(run, name)
 
 
 def _evaluations(path: Path) -> tuple[Array, Array]:

@@ -50,7 +50,7 @@ class Objective:
         import optuna
 
         from sb3_sparse.tuning import Objective, Space
-        from sb3_sparse.zoo.spec import RunSpec
+        from sb3_sparse.zoo import RunSpec
 
         run = RunSpec("dqn", "CartPole-v1", method="rigl", n_timesteps=200, eval_freq=100)
         decays = optuna.distributions.CategoricalDistribution([0.0, 1e-4])

@@ -42,7 +42,7 @@ class Tuned:
     Example::
 
         from sb3_sparse.tuning import tune
-        from sb3_sparse.zoo.spec import RunSpec
+        from sb3_sparse.zoo import RunSpec
 
         run = RunSpec("dqn", "CartPole-v1", method="static", n_timesteps=200, eval_freq=100)
         tuned = tune(run, trials=1)
