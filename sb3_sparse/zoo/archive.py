@@ -52,9 +52,7 @@ class Archived:
     measured: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
-    def of_folder(
-        cls, folder: RunFolder, address: str, files: Iterable[str] = ()
-    ) -> Archived:
+    def of_folder(cls, folder: RunFolder, address: str, files: Iterable[str] = ()) -> Archived:
         """Read a run's folder.
 
         :param files: names of the files of measurements that it may have
