@@ -16,7 +16,6 @@ import numpy.typing as npt
 
 from sb3_sparse.errors import ConfigError, CorruptStateError, SparsityError
 from sb3_sparse.loading.arrays import read_arrays
-from sb3_sparse.report.complete import check_complete, check_reached
 from sb3_sparse.report.measured import Rows, measured_text, rows_of
 from sb3_sparse.report.methods import DENSE, EQUAL
 from sb3_sparse.zoo.archive import Archived
@@ -29,6 +28,8 @@ from sb3_sparse.zoo.settings import Settings
 Array = npt.NDArray[np.float64]
 WIDTHS = ("net_arch", "features_extractor_class", "features_extractor_kwargs")
 """What follows from the sparsity in a dense network that matches a sparse one's parameters."""
+NEAR = 0.01
+"""Share of the connections that a run may miss; rounding and schedules miss far less."""
 MEASURED = {
     "snr.csv": ("timesteps", "name", "value"),
     "plasticity.csv": ("timesteps", "name", "value"),
@@ -232,11 +233,11 @@ def _read(folder: Path, archived: Archived | None) -> tuple[RunData, list[str]]:
     empty = np.zeros(0)
     diverged = ""
     with record.reading():
-        check_complete(record)
+        _check_complete(record)
         if record.status is Status.DIVERGED:
             diverged = _divergence(RunData(folder, record, empty, empty))
         else:
-            check_reached(record)
+            _check_reached(record)
     if diverged:
         raise _DivergedRun(diverged)
     timesteps, returns = empty, empty
@@ -314,3 +315,45 @@ def _identity(run: RunData) -> str:
     asked = {name: run.record["run"].get(name) for name in keys}
     content = [asked, run.record["method"], run.trained, dict(run.settings)]
     return json.dumps(content, sort_keys=True, default=str)
+
+
+def _check_complete(record: Record) -> None:
+    """Check that a run has ended and that its record lacks nothing.
+
+    :raises ConfigError: with the status or the missing part
+    """
+    if record.status is Status.FAILED:
+        raise ConfigError(f"failed: {record.get('error') or 'no reason is recorded'}")
+    if not record.status.is_over:
+        raise ConfigError(f"not finished: its status is {str(record.status)!r}")
+    for name in ("run", "settings", "total", "layers", "method"):
+        if not record.get(name):
+            raise ConfigError(f"{NAME} is incomplete: {name!r} is missing")
+    needed = {"run": ("algo", "env_id", "seed"), "total": ("sparsity", "parameters", "flops")}
+    for part, names in needed.items():
+        for name in names:
+            if not isinstance(record[part], dict) or record[part].get(name) is None:
+                raise ConfigError(f"{NAME} is incomplete: {part}.{name} is missing")
+
+
+def _check_reached(record: Record) -> None:
+    """Check that a run's networks are as sparse as its settings say.
+
+    Older records lack ``wanted_nnz``; only runs with a denser start can have stayed too dense.
+
+    :raises ConfigError: with the sparsity that it reached and the one that it should have reached
+    """
+    total, kwargs = record["total"], record.settings["policy_kwargs"]
+    reached, asked = float(total["sparsity"]), kwargs.get("sparsity")
+    wanted = total.get("wanted_nnz")
+    if wanted is not None:
+        missed = abs(int(total["nnz"]) - int(wanted)) > NEAR * int(wanted)
+    else:
+        denser = kwargs.get("initial_sparsity") is not None and isinstance(asked, (int, float))
+        missed = denser and reached < asked - NEAR
+    if missed:
+        raise ConfigError(
+            f"its sparsity is {reached:.2%}, not the {asked} that its settings ask for: it was not "
+            "pruned, or not to the end; train it again with a callback that prunes, longer or with "
+            "a smaller update_interval"
+        )
