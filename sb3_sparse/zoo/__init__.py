@@ -1,4 +1,4 @@
-"""Training runs in the manner of the RL zoo: what to train, training it, and what it leaves."""
+"""Training runs in the style of the RL zoo: specifying, training, resuming and reading them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An archive of runs that are over: a JSON-lines file with a line for each, to be committed."""
+"""Archive of ended runs: a JSON-lines file with one run per line, meant to be committed."""
 
 from __future__ import annotations
 
@@ -25,23 +25,23 @@ from sb3_sparse.zoo.record import Record, Status
 
 Array = npt.NDArray[np.float64]
 Lines = Mapping[str, "Sequence[Archived]"]
-"""The lines of an archive by address, each address's in the order of the file."""
+"""An archive's lines by address, in file order."""
 WHAT = "line of an archive"
-CURE = "restore it from a copy, or remove the line: its run counts as not done then"
-DECIMALS = 6  # of returns, as SB3's Monitor rounds them
+CURE = "restore it from a copy, or remove the line; its run then counts as not done"
+DECIMALS = 6  # returns are rounded as SB3's Monitor rounds them
 BEGINNING = b'{"address"'
 
 
 @dataclass(frozen=True, eq=False)
 class Archived:
-    """All that is kept of a run; its models are not.
+    """What an archive keeps of a run: everything except its models.
 
-    :param address: names what was run
-    :param record: content of its ``sparsity.json``, settings and counts among it
-    :param timesteps: environment steps of each evaluation, shape ``[T]``
-    :param returns: of each evaluation's episodes, shape ``[T, episodes]``
-    :param lengths: steps of these episodes, shape ``[T, episodes]``
-    :param measured: text of its files of measurements, by file name
+    :param address: identifies what was run
+    :param record: content of the run's ``sparsity.json``, including settings and counts
+    :param timesteps: environment steps at each evaluation, shape ``[T]``
+    :param returns: episode returns of each evaluation, shape ``[T, episodes]``
+    :param lengths: episode lengths in steps, shape ``[T, episodes]``
+    :param measured: text of the run's measurement files, by file name
     """
 
     address: str
@@ -55,9 +55,9 @@ class Archived:
     def of_folder(cls, folder: RunFolder, address: str, files: Iterable[str] = ()) -> Archived:
         """Read a run's folder.
 
-        :param files: names of the files of measurements that it may have
-        :raises ConfigError: if there is no run, or it is not over
-        :raises CorruptStateError: if something is damaged
+        :param files: names of the measurement files to read where they exist
+        :raises ConfigError: if the folder holds no run, or the run has not ended
+        :raises CorruptStateError: if a file is damaged
         """
         record, path = folder.record(), folder.evaluations
         if not record.status.is_over:
@@ -80,11 +80,11 @@ class Archived:
 
     @classmethod
     def of_line(cls, line: bytes, source: Path) -> Archived:
-        """Read what :meth:`line` wrote.
+        """Parse a line that :meth:`line` wrote.
 
         :param source: file and line, for messages
 
-        :raises Exception: of any kind, if it is damaged; call it within
+        :raises Exception: of any kind, if the line is damaged; call it inside
             :func:`~sb3_sparse.loading.guard.reading`
         """
         content = json.loads(line.decode())
@@ -107,7 +107,7 @@ class Archived:
         return cls(address, record, **_evaluations(content["evaluations"]), measured=measured)
 
     def line(self) -> bytes:
-        """The run as one line of JSON, with its end."""
+        """Return the run as one line of JSON, newline included."""
         parts = {"timesteps": self.timesteps, "returns": self.returns, "lengths": self.lengths}
         content = {
             "address": self.address,
@@ -120,13 +120,13 @@ class Archived:
         return json.dumps(content, separators=(",", ":")).encode() + b"\n"
 
     def covers(self, other: Archived) -> bool:
-        """Whether this is the same run, with all that was measured of the other."""
+        """Whether this is the same run and has every measurement of the other."""
         here, there = self.record.measured, other.record.measured
         return self.address == other.address and {**here, **there} == here
 
 
 class Archive:
-    """A JSON-lines file with a line for each run. Processes may read it and append to it at once.
+    """A JSON-lines file with one run per line, which processes may read and append to at once.
 
     Example::
 
@@ -140,16 +140,16 @@ class Archive:
         (run,) = archive.read()["my-run"]
         print(run.record["total"]["sparsity"], run.returns.mean(axis=1))
 
-    :param path: of the file; it need not exist yet
+    :param path: the file; it need not exist yet
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
 
     def read(self) -> Lines:
-        """All lines, checked; a last one that was cut off while it was written is left out.
+        """Read and check all lines; skip a last line that was cut off while being written.
 
-        :raises ConfigError: if it cannot be opened
+        :raises ConfigError: if the file cannot be opened
         :raises CorruptStateError: if a line is damaged
         """
         with (
@@ -161,20 +161,20 @@ class Archive:
         whole, rest = self._parsed(content)
         if rest:
             warn(
-                f"the last line of {self.path} was cut off while it was written, and is left out; "
-                "study run --archive mends the file"
+                f"the last line of {self.path} was cut off while being written and is skipped; "
+                "study run --archive repairs the file"
             )
         return whole
 
     def add(self, runs: Iterable[Archived]) -> None:
-        """Append runs that it has not, each as a whole line that is on the disk afterwards.
+        """Append the runs that the archive lacks, as complete lines that are synced to disk.
 
-        What a killed process has left of a line is removed: its run's folder still has it all.
+        A partial line left by a killed process is removed; its run's folder still has the data.
 
-        :raises CorruptStateError: if a line is damaged; then nothing is written
-        :raises Unwritable: if the file cannot be written; then it is as before
+        :raises CorruptStateError: if a line is damaged; nothing is written then
+        :raises Unwritable: if the file cannot be written; it is left unchanged
         """
-        cure = "free space or make it writable, and give the command again; no run is lost"
+        cure = "free space or make it writable, then repeat the command; no run is lost"
         with writing(self.path.parent, cure):
             self.path.parent.mkdir(parents=True, exist_ok=True)
             with self.path.open("a+b", buffering=0) as file, _locked(file, alone=True):
@@ -189,12 +189,12 @@ class Archive:
                     _write_at(file, len(whole), text)
 
     def _parsed(self, content: bytes) -> tuple[Lines, bytes]:
-        """The lines by address, and what a killed process has left of another."""
+        """Return the lines by address, and any partial line that a killed process left."""
         *lines, rest = content.split(b"\n")
         if rest and _is_whole(rest):
             lines, rest = [*lines, rest], b""
         if rest and not (rest.startswith(BEGINNING) or BEGINNING.startswith(rest)):
-            lines, rest = [*lines, rest], b""  # no line of ours: damaged
+            lines, rest = [*lines, rest], b""  # not the start of a line: damaged
         found: dict[str, list[Archived]] = {}
         for number, line in enumerate(lines, start=1):
             if line.strip():
@@ -206,7 +206,7 @@ class Archive:
 
 
 def _write_at(file: IO[bytes], end: int, text: bytes) -> None:
-    """Put a text in place of all after an end, whole and on the disk, or not at all."""
+    """Replace everything after ``end`` with a text, complete and synced, or not at all."""
     left = memoryview(text)
     try:
         file.truncate(end)
@@ -231,9 +231,9 @@ def _is_whole(line: bytes) -> bool:
 
 
 def _evaluations(given: Mapping[str, Any]) -> dict[str, Array]:
-    """Arrays of numbers that suit one another.
+    """Return the evaluations as arrays of matching shapes.
 
-    :raises ValueError: if they do not
+    :raises ValueError: if the shapes do not match, or a number is not finite
     """
     names = ("timesteps", "returns", "lengths")
     found = {name: np.asarray(given[name], np.float64) for name in names}
@@ -248,7 +248,7 @@ def _evaluations(given: Mapping[str, Any]) -> dict[str, Array]:
 
 
 def _short(value: Any) -> Any:
-    """Numbers as short as they can be written."""
+    """Round numbers, and make whole ones integers, so that they take little space."""
     if isinstance(value, list):
         return [_short(one) for one in value]
     return int(value) if value == int(value) else round(value, DECIMALS)
@@ -256,12 +256,12 @@ def _short(value: Any) -> Any:
 
 @contextmanager
 def _locked(file: IO[bytes], alone: bool) -> Iterator[None]:
-    """Within it, no other process writes, nor, if alone, reads."""
+    """Keep other processes from writing and, if ``alone``, from reading."""
     if sys.platform == "win32":
         import msvcrt
 
         def hold(mode: int) -> None:
-            file.seek(2**31 - 2)  # a place that no line reaches: others could not read it
+            file.seek(2**31 - 2)  # beyond all lines: nobody can read a locked byte
             msvcrt.locking(file.fileno(), mode, 1)
             file.seek(0)
 

@@ -1,4 +1,4 @@
-"""What each argument of SB3's algorithms and policies, and of rl-zoo, may be.
+"""Allowed values of the arguments of SB3's algorithms and policies, and of rl-zoo.
 
 SB3 checks few of them: text as ``learning_starts`` fails in the middle of training, ``gamma: 5``
 trains nonsense, and ``buffer_size: 0`` becomes 1.
@@ -18,9 +18,9 @@ from sb3_sparse.sparsity.numeric import is_whole
 
 @dataclass(frozen=True)
 class Kind:
-    """What an argument may be.
+    """A kind of value that an argument accepts.
 
-    :param allowed: in words, after "must be"
+    :param allowed: its description, which follows "must be" in messages
     :param fits: whether a value is allowed
     """
 
@@ -32,7 +32,7 @@ class Kind:
 
 
 def is_finite(value: Any) -> bool:
-    """Whether it is a number, and finite."""
+    """Whether a value is a finite number."""
     return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
 
 
@@ -53,7 +53,7 @@ def _word(*words: str) -> Kind:
 
 
 def _after(prefix: str, of: Kind, text: str) -> Kind:
-    """Text that is a prefix and a number, as rl-zoo and SB3 read it."""
+    """Accept a prefix followed by a number, as rl-zoo and SB3 parse it."""
 
     def fits(value: Any) -> bool:
         if not isinstance(value, str) or not value.startswith(prefix):
@@ -80,7 +80,7 @@ def _widths(value: Any) -> bool:
 
 
 def _two_widths(critic: str) -> Kind:
-    """Widths of actor and critic, which have names of their own."""
+    """Accept separate widths of actor (``pi``) and critic."""
 
     def fits(value: Any) -> bool:
         named = isinstance(value, Mapping) and value.keys() == {"pi", critic}
@@ -95,7 +95,7 @@ NUMBER = Kind("a number", is_finite)
 POSITIVE = Kind("a number above 0", lambda v: is_finite(v) and v > 0)
 SHARE = _between(0, 1)
 MAPPING = Kind("a mapping of names to values", lambda v: isinstance(v, Mapping))
-CODE = Kind("a text of Python, dict(...)", lambda v: isinstance(v, str) and bool(v.strip()))
+CODE = Kind("Python code, dict(...)", lambda v: isinstance(v, str) and bool(v.strip()))
 CLASS = Kind(
     "a class or its dotted path, e.g. torch.nn.ReLU",
     lambda v: (
@@ -104,7 +104,7 @@ CLASS = Kind(
 )
 STEPS = _whole(1)
 DECAY = "lin_ and a number for a linear decay to 0, e.g. lin_0.001"
-AUTO = _word("auto") | _after("auto_", POSITIVE, "auto_ and where it begins, e.g. auto_0.1")
+AUTO = _word("auto") | _after("auto_", POSITIVE, "auto_ and an initial value, e.g. auto_0.1")
 WRAPPER = (
     Kind(
         "a dotted path, a path with its arguments, or a list of these",
@@ -177,7 +177,7 @@ _WIDTHS = Kind("a list of widths, e.g. [256, 256]", _widths) | NONE
 _TUNED_ENTROPY = {"ent_coef": _from(0) | AUTO}
 _OFF_POLICY = {"net_arch": _WIDTHS | _two_widths("qf")}
 _ON_POLICY = {"net_arch": _WIDTHS | _two_widths("vf")}
-OF_ONE = {  # where a name means something else
+OF_ONE = {  # for names that mean something else there
     "sac": {**_TUNED_ENTROPY, **_OFF_POLICY},
     "tqc": {**_TUNED_ENTROPY, **_OFF_POLICY},
     "crossq": {**_TUNED_ENTROPY, **_OFF_POLICY},
@@ -233,10 +233,10 @@ POLICY: dict[str, Kind] = {
 
 
 def kind_of(algo: str, name: str) -> Kind | None:
-    """What an argument may be; None if this table does not know it.
+    """Return the kind of an argument, or None if the tables do not list it.
 
     :param algo: algorithm, e.g. ``"sac"``
-    :param name: of the algorithm's, its policy's or rl-zoo's argument; these do not overlap
+    :param name: argument of the algorithm, its policy or rl-zoo; these names do not overlap
     """
     of_one = (OF_ONE.get(name, {}) for name in lineage(algo))
     for table in (*of_one, ALGORITHM, ZOO, POLICY):

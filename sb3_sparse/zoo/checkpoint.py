@@ -1,4 +1,4 @@
-"""What an interrupted run goes on from."""
+"""Checkpoints, from which an interrupted run resumes."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ from sb3_sparse.zoo.evaluation import Evaluation
 from sb3_sparse.zoo.folder import MONITOR, REPLAY_BUFFER, VECNORMALIZE, RunFolder, env_name
 from sb3_sparse.zoo.replay import BufferSaver
 
-SECONDS = 120.0  # of training, that a kill may cost where evaluations are far apart
+SECONDS = 120.0  # the most training that a kill may cost where evaluations are far apart
 
 
 class StopTraining(Exception):
-    """Raised through ``learn`` at the start of a rollout, so that no further step is taken."""
+    """Raised at the start of a rollout to leave ``learn`` before another step is taken."""
 
 
 class Checkpoints(BaseCallback):
-    """Saves everything after each evaluation and every two minutes, and stops cleanly when asked.
+    """Saves checkpoints after each evaluation and every two minutes, and stops cleanly on request.
 
-    Saves at the start of a rollout, when all experience has been learnt from. A checkpoint is a
-    folder ``resume/<steps>``; it appears whole or not at all, and then the one before goes. Model
-    and normalisation lie in it as rl-zoo's ``--trained-agent`` reads them.
+    It saves at the start of a rollout, when training has used all experience. A checkpoint is a
+    folder ``resume/<steps>``, written completely or not at all, which replaces the previous one.
+    Its model and normalisation have the layout that rl-zoo's ``--trained-agent`` reads.
 
-    :param folder: of the run
-    :param env_id: environment that the model is trained in
-    :param evaluation: whose evaluations belong to the checkpoint
+    :param folder: the run's folder
+    :param env_id: environment that the model trains in
+    :param evaluation: callback whose evaluations the checkpoint includes
     """
 
     def __init__(self, folder: RunFolder, env_id: str, evaluation: Evaluation) -> None:
@@ -67,9 +67,9 @@ class Checkpoints(BaseCallback):
         return True
 
     def save(self) -> None:
-        """Save the model as it is now.
+        """Save a checkpoint now.
 
-        :raises Diverged: if its networks hold NaN; the checkpoint before stays
+        :raises Diverged: if the networks hold NaN; the previous checkpoint stays
         """
         check_networks(self.model)
         parent = self.folder.checkpoints
@@ -80,7 +80,7 @@ class Checkpoints(BaseCallback):
         shutil.rmtree(new, ignore_errors=True)
         try:
             self._write(new, final)
-        except Exception:  # a full disk, which has room again for the record that says so
+        except Exception:  # e.g. a full disk: make room to record the failure
             shutil.rmtree(new, ignore_errors=True)
             raise
         new.rename(final)
@@ -91,7 +91,7 @@ class Checkpoints(BaseCallback):
                 shutil.rmtree(other)
 
     def _write(self, new: Path, final: Path) -> None:
-        """Write everything into a folder that will have another name."""
+        """Write everything into ``new``, which will be renamed ``final``."""
         (new / self.env_name).mkdir(parents=True)
         self.model.save(new / f"{self.env_name}.zip")
         if self.buffer is not None:
@@ -108,9 +108,9 @@ class Checkpoints(BaseCallback):
 
     @contextmanager
     def on_signals(self) -> Iterator[None]:
-        """Within it, SIGINT and SIGTERM ask for a stop; a second SIGINT interrupts at once."""
+        """Let SIGINT and SIGTERM request a stop; a second SIGINT interrupts at once."""
         if threading.current_thread() is not threading.main_thread():
-            yield  # where Python allows no handlers
+            yield  # Python allows no handlers here
             return
 
         def ask(number: int, frame: FrameType | None) -> None:
@@ -120,8 +120,8 @@ class Checkpoints(BaseCallback):
                 return  # SIGTERM, which a launcher sends after a terminal's Ctrl-C
             self.stop_wanted = True
             print(
-                "\nStopping as soon as this rollout has been learnt from; Ctrl-C again stops at "
-                "once and falls back to the last checkpoint",
+                "\nStopping at the end of this rollout; Ctrl-C again stops at once and falls back "
+                "to the last checkpoint",
                 file=sys.stderr,
             )
 
@@ -135,11 +135,10 @@ class Checkpoints(BaseCallback):
 
 @contextmanager
 def restored_monitors(folder: Path, checkpoint: Path | None) -> Iterator[None]:
-    """Set aside the training episodes that a checkpoint knows of, and forget all later ones.
+    """Keep a checkpoint's training episodes under new names, and remove all later ones.
 
-    What was ``0.monitor.csv`` becomes ``0.1.monitor.csv``, and so on: a file for each time that the
-    run was started, since SB3 reads times relative to a file's own start. If what is done within
-    fails, all is as it was.
+    ``0.monitor.csv`` becomes ``0.1.monitor.csv``, and so on: one file per start of the run, since
+    SB3 reads times relative to each file's start. If the body raises, the files are restored.
     """
     before = {path: path.read_bytes() for path in folder.glob(f"*{MONITOR}")}
     after = _monitors_in(checkpoint)
@@ -152,7 +151,7 @@ def restored_monitors(folder: Path, checkpoint: Path | None) -> Iterator[None]:
 
 
 def _monitors_in(checkpoint: Path | None) -> dict[str, bytes]:
-    """Content of the training episodes' files by the names that they shall have."""
+    """Return the content of a checkpoint's monitor files by their new names."""
     found: dict[str, bytes] = {}
     for path in [] if checkpoint is None else checkpoint.glob(f"*{MONITOR}"):
         rank, *part = path.name.removesuffix(MONITOR).split(".")

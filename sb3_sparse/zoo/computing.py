@@ -1,7 +1,7 @@
-"""How a run computes, as its record says: what was asked for, what came of it, and on what.
+"""How a run computes, for its record: what was requested, what was chosen, and on what.
 
-Equal seeds give equal runs where all of this is equal: instruction sets and threads decide in
-which order numbers are added, and so how they are rounded.
+Equal seeds give equal runs where all of this is equal: instruction sets and threads determine
+the order in which numbers are added, and so how they are rounded.
 """
 
 from __future__ import annotations
@@ -22,21 +22,21 @@ from sb3_sparse.policies.report import COMPUTES, SPARSE
 from sb3_sparse.zoo.record import CURE, Record
 
 FUSED, OWN = "fused", "SB3's own"
-"""Ways in which gradient steps run."""
+"""The two ways in which gradient steps run."""
 FORMER = {"non-zeros": SPARSE}
-"""Words of older records for how a layer computes, and today's."""
+"""Older records' words for how a layer computes, and today's."""
 
 
 @dataclass(frozen=True)
-class Sitting:
+class Session:
     """A stretch of training in one process.
 
-    :param num_timesteps: environment steps when it began
+    :param num_timesteps: environment steps at its start
     :param instructions: instruction set of the kernels; None: they are not compiled
     :param torch_instructions: instruction set of torch's own kernels
-    :param threads: of torch, and so of the kernels
-    :param layers: how each layer computed when it began, by name
-    :param gradient_steps: how they ran when it began, as :func:`gradient_steps_of` says it
+    :param threads: number of threads of torch, and so of the kernels
+    :param layers: how each layer computed at its start, by name
+    :param gradient_steps: how gradient steps ran then, as :func:`gradient_steps_of` returns it
     """
 
     num_timesteps: int
@@ -44,7 +44,7 @@ class Sitting:
     torch_instructions: str
     threads: int
     layers: Mapping[str, str]
-    gradient_steps: str = OWN  # as in records that say nothing of it
+    gradient_steps: str = OWN  # the default for records that lack it
 
     def __str__(self) -> str:
         sparse = sum(how == SPARSE for how in self.layers.values())
@@ -59,18 +59,18 @@ class Sitting:
 
 @dataclass(frozen=True)
 class Computing:
-    """How a run computes.
+    """How a run computed.
 
-    :param asked: ``compute`` of the policy
-    :param sittings: stretches of training, one after the other
+    :param asked: the policy's ``compute``
+    :param sittings: its sessions in order, under the name that records have for them
     """
 
     asked: str
-    sittings: tuple[Sitting, ...]
+    sittings: tuple[Session, ...]
 
 
 def gradient_steps_of(model: BaseAlgorithm) -> str:
-    """How a model's gradient steps run: ``"fused"``, or ``"SB3's own"`` and why."""
+    """Return how a model's gradient steps run: ``"fused"``, or ``"SB3's own"`` and why."""
     if not isinstance(model, Fused):
         return f"{OWN}: {type(model).__name__} has no others"
     why = model.why_not_fused()
@@ -78,18 +78,18 @@ def gradient_steps_of(model: BaseAlgorithm) -> str:
 
 
 def computing_at(model: BaseAlgorithm, record: Record) -> dict[str, Any]:
-    """What a run's record shall say of how it computes, when a sitting begins.
+    """Return the record's entry on how a run computes, at the start of a session.
 
-    A sitting that began at the model's step or later is not part of the run: it was killed before
-    its first checkpoint.
+    Earlier sessions that began at the model's step or later are dropped: they were killed before
+    their first checkpoint.
 
-    :param model: with a sparse policy
-    :param record: the run's, so far
+    :param model: a model with a sparse policy
+    :param record: the run's record so far
     """
     policy = unwrapped(model.policy)
     assert isinstance(policy, BaseSparsePolicy)
     known = computing_in(record)
-    now = Sitting(
+    now = Session(
         model.num_timesteps,
         None if why_missing() else in_use(),
         th.backends.cpu.get_cpu_capability(),
@@ -103,30 +103,30 @@ def computing_at(model: BaseAlgorithm, record: Record) -> dict[str, Any]:
 
 
 def computing_in(record: Record) -> Computing | None:
-    """What a run's record says of how it computes; None in records of older versions.
+    """Read from a record how its run computed; None in records of older versions.
 
-    :raises CorruptStateError: if it is damaged
+    :raises CorruptStateError: if the record is damaged
     """
     if "computing" not in record:
         return None
     with record.reading():
         found = record["computing"]
         sittings = tuple(
-            Sitting(**{**one, "layers": _read(one["layers"])}) for one in found["sittings"]
+            Session(**{**one, "layers": _read(one["layers"])}) for one in found["sittings"]
         )
         for one in sittings:
             if type(one.num_timesteps) is not int:
-                raise CorruptStateError(f"a sitting began at step {one.num_timesteps!r}")
+                raise CorruptStateError(f"a session began at step {one.num_timesteps!r}")
             if not isinstance(one.gradient_steps, str):
                 raise CorruptStateError(f"its gradient steps were {one.gradient_steps!r}")
         return Computing(str(found["asked"]), sittings)
 
 
 def layers_in(record: Record) -> dict[tuple[str, int], str]:
-    """How each layer of a run computes, or did when it was last saved, by name and nnz.
+    """Read from a record how each layer computed when it was last saved, by name and nnz.
 
-    :return: empty in records of older versions
-    :raises CorruptStateError: if it is damaged
+    :return: an empty mapping for records of older versions
+    :raises CorruptStateError: if the record is damaged
     """
     with record.reading():
         layers = [one for one in record.get("layers", []) if "compute" in one]
@@ -135,23 +135,23 @@ def layers_in(record: Record) -> dict[tuple[str, int], str]:
 
 
 def _read(layers: Mapping[str, Any]) -> dict[str, str]:
-    """How each layer computes, in today's words.
+    """Translate how each layer computes into today's words.
 
-    :raises CorruptStateError: if a record has a word that it cannot have
+    :raises CorruptStateError: for an unknown word
     """
     found = {name: FORMER.get(how, how) for name, how in layers.items()}
     for name, how in found.items():
         if how not in COMPUTES:
             raise CorruptStateError(
-                f"{name} computes {how!r}, which is none of {', '.join(COMPUTES)}; {CURE}"
+                f"{name} computes {how!r}, but allowed are {', '.join(COMPUTES)}; {CURE}"
             )
     return found
 
 
 def counts_of(policy: BaseSparsePolicy) -> dict[str, Any]:
-    """A policy's connections, parameters and FLOPs now: in total, by network and layer by layer.
+    """Count a policy's connections, parameters and FLOPs: in total, by network and by layer.
 
-    ``wanted_nnz`` are the active connections that its settings ask for.
+    ``wanted_nnz`` counts the active connections that its settings ask for.
     """
     report = policy.sparsity_report()
     networks = dict.fromkeys(layer.network for layer in report.layers)

@@ -16,21 +16,21 @@ METHODS = ("dense", "prune", "static", "set", "rigl")
 
 
 def config_root() -> Path:
-    """The folder that holds the shipped configs."""
+    """Return the folder of the shipped configs."""
     return next(root for root in ROOTS if root.is_dir())
 
 
 def config_path(method: str, algo: str) -> Path:
-    """The YAML file of a method and an algorithm, in rl-zoo's form.
+    """Return the YAML file of a method and an algorithm, in rl-zoo's form.
 
     :param method: ``"dense"``, ``"prune"``, ``"static"``, ``"set"`` or ``"rigl"``
-    :param algo: algorithm, e.g. ``"sac"``, or another name in that folder, e.g. ``"dqn_impala"``
-    :raises ConfigError: if none is shipped
+    :param algo: algorithm, e.g. ``"sac"``, or another file in that folder, e.g. ``"dqn_impala"``
+    :raises ConfigError: if no such file is shipped
     """
     if method not in METHODS:
         raise ConfigError(
             f"no config is shipped for method {method!r}, only for {', '.join(METHODS)}"
-            f"{did_you_mean(method, METHODS)}. Or write one and give it as --conf-file "
+            f"{did_you_mean(method, METHODS)}. Or write one and pass it as --conf-file "
             "(docs/configs.md)"
         )
     path = config_root() / method / f"{algo}.yml"
@@ -38,18 +38,17 @@ def config_path(method: str, algo: str) -> Path:
         names = sorted(file.stem for file in path.parent.glob("*.yml"))
         raise ConfigError(
             f"no config is shipped for {algo!r}, only for {', '.join(names)}"
-            f"{did_you_mean(algo, names)}. Or write one and give it as --conf-file "
+            f"{did_you_mean(algo, names)}. Or write one and pass it as --conf-file "
             "(docs/configs.md)"
         )
     return path
 
 
 def read_yaml(path: Path, what: str = "environment ids to settings") -> dict[str, Any]:
-    """The mapping in a YAML file.
+    """Return the mapping in a YAML file.
 
-    :param what: it maps, for the message
-    :raises ConfigError: if there is no such file, it cannot be read, holds no mapping, or one in
-        which a key stands twice
+    :param what: what the file maps, for messages
+    :raises ConfigError: if the file is missing, unreadable or not a mapping, or repeats a key
     """
     return deepcopy(_read(path, what))
 
@@ -62,11 +61,11 @@ def _read(path: Path, what: str = "environment ids to settings") -> dict[str, An
     try:
         content = _parsed(path.read_text(encoding="utf-8"))
     except UnicodeDecodeError as error:
-        raise ConfigError(f"{path} is no text in UTF-8 ({error}); save it as UTF-8") from error
+        raise ConfigError(f"{path} is not UTF-8 text ({error}); save it as UTF-8") from error
     except OSError as error:
         raise ConfigError(f"{path} cannot be read: {error.strerror}") from error
     except ConfigError as error:
-        raise ConfigError(f"{path} is no valid YAML: {error}") from error
+        raise ConfigError(f"{path} is not valid YAML: {error}") from error
     if not isinstance(content, dict):
         raise ConfigError(f"{path} must map {what}, got {content!r}")
     return content
@@ -74,17 +73,17 @@ def _read(path: Path, what: str = "environment ids to settings") -> dict[str, An
 
 @lru_cache(maxsize=64)
 def _parsed(text: str) -> Any:
-    """What a text says; once, since a study asks for the same files thousands of times."""
+    """Parse a text once, since a study asks for the same files thousands of times."""
     return parse(text)
 
 
 def entry_of(path: Path, env_id: str, atari: bool) -> dict[str, Any]:
-    """The settings of an environment, looked up as rl-zoo does; a copy of one's own.
+    """Return a copy of an environment's settings, looked up as rl-zoo does.
 
     :param path: YAML file
     :param env_id: environment
-    :param atari: whether it is an Atari game, which ``atari`` serves
-    :raises ConfigError: if the file has nothing for this environment
+    :param atari: whether it is an Atari game, to which the key ``atari`` applies
+    :raises ConfigError: if the file has no settings for this environment
     """
     content = _read(path)
     shared = "atari" if atari else "default"
@@ -94,7 +93,7 @@ def entry_of(path: Path, env_id: str, atari: bool) -> dict[str, Any]:
         raise ConfigError(
             f"{path} has no settings for {env_id!r}; its keys are {', '.join(map(str, content))}"
             f"{did_you_mean(env_id, map(str, content))}. Add the key {env_id!r}, or `{shared}` for "
-            f"every {others} without a key of its own"
+            f"every {others} without its own key"
         )
     entry = content[key]
     if not isinstance(entry, dict):
@@ -103,7 +102,7 @@ def entry_of(path: Path, env_id: str, atari: bool) -> dict[str, Any]:
 
 
 def evaluation_of(algo: str, env_id: str, atari: bool) -> dict[str, int]:
-    """How a run is evaluated: ``eval_freq`` (environment steps) and ``eval_episodes``."""
+    """Return how a run is evaluated: ``eval_freq`` (environment steps) and ``eval_episodes``."""
     suites = _read(config_root() / "evaluation.yml")
     suite = suites.get(algo, suites["default"])
     shared = "atari" if atari else "default"

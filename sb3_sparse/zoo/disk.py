@@ -1,4 +1,4 @@
-"""What to say when something cannot be written."""
+"""Explains why a file or folder cannot be written."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from sb3_sparse.errors import Unwritable
 
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 FORBIDDEN = (errno.EROFS, errno.EACCES, errno.EPERM, errno.ENOTDIR)
-LITTLE = 2**16  # bytes; PyTorch hides that a disk was full
+LITTLE = 2**16  # bytes free; PyTorch does not report that a disk is full
 
 
 def refusal(error: BaseException | None, folder: Path) -> str | None:
-    """What a disk refused, if that is behind an error; None if it is something else.
+    """Return why the disk caused an error; None if something else did.
 
-    :param error: that writing has raised, itself or its causes
-    :param folder: that was written to
+    :param error: the error that writing raised; its causes are searched too
+    :param folder: the folder being written to
     """
     torch = False
     while error is not None:
@@ -34,11 +34,11 @@ def refusal(error: BaseException | None, folder: Path) -> str | None:
 
 @contextmanager
 def writing(folder: Path, cure: str) -> Iterator[None]:
-    """Within it, what a disk refuses is said in one line.
+    """Report errors of the disk in one line.
 
-    :param folder: that is written to
-    :param cure: what to do then
-    :raises Unwritable: if the disk is full or the folder cannot be written to
+    :param folder: the folder being written to
+    :param cure: what to do about it, for the message
+    :raises Unwritable: if the disk is full or the folder is not writable
     """
     try:
         yield

@@ -1,4 +1,4 @@
-"""Whether a training still computes with numbers."""
+"""Checks that networks and returns stay finite during training."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from sb3_sparse.policies.compiled import unwrapped
 
 CURE = (
     "train anew with a smaller learning_rate, or a smaller max_grad_norm where the algorithm has "
-    "one, and see that the environment's observations and rewards are finite"
+    "one, and check that the environment's observations and rewards are finite"
 )
 SHOWN = 3
 
 
 def check_networks(model: BaseAlgorithm) -> None:
-    """Refuse to go on with networks that hold NaN or infinity.
+    """Raise if a network holds NaN or infinity.
 
-    Looks at parameters and buffers of the whole policy, targets included, and at the algorithm's
-    own (the entropy coefficient).
+    Checks the parameters and buffers of the whole policy, targets included, and the algorithm's
+    own tensors (the entropy coefficient).
 
-    :raises Diverged: with the step, the first names, and what to do
+    :raises Diverged: naming the step, the first broken tensors, and what to do
     """
     broken = [name for name, tensor in _tensors(model) if not bool(th.isfinite(tensor).all())]
     if broken:
@@ -37,15 +37,15 @@ def check_networks(model: BaseAlgorithm) -> None:
 
 
 def check_return(mean_return: float, step: int) -> None:
-    """Refuse to go on after an evaluation whose return is no number.
+    """Raise if the mean return of an evaluation is not finite.
 
     :param step: environment steps trained
-    :raises Diverged: if so
+    :raises Diverged: naming the step, the return, and what to do
     """
     if not math.isfinite(mean_return):
         raise Diverged(
-            f"training diverged: the evaluation at step {step} has the return {mean_return}, of "
-            f"networks that are finite; {CURE}"
+            f"training diverged: the evaluation at step {step} has the return {mean_return}, "
+            f"though all networks are finite; {CURE}"
         )
 
 

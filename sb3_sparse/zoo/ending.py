@@ -1,4 +1,4 @@
-"""How a run ends that does not finish: what goes on record, and what is raised."""
+"""Handles runs that end early: what is recorded, and what is raised."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from sb3_sparse.zoo.record import Status
 
 @contextmanager
 def recorded(folder: RunFolder, env_id: str, model: BaseAlgorithm) -> Iterator[None]:
-    """Put on record whatever ends the run within.
+    """Record any error that ends the run.
 
-    :raises Diverged: with what is left of the run
-    :raises Unwritable: with how to resume
+    :raises Diverged: naming the policy that is kept
+    :raises Unwritable: explaining how to resume
     """
     try:
         yield
@@ -33,21 +33,21 @@ def recorded(folder: RunFolder, env_id: str, model: BaseAlgorithm) -> Iterator[N
             folder.write(status=Status.FAILED, error=reason)
         except OSError:
             if refused is None:
-                raise  # else the record stays at "running", as of a run that was killed
+                raise  # else the record stays "running", as after a kill
         if refused is None:
             raise
         raise Unwritable(f"{refused}. {_how_to_resume(folder, model)}") from error
 
 
 def _diverged(folder: RunFolder, env_id: str, model: BaseAlgorithm, error: Diverged) -> Diverged:
-    """Keep the last policy whose networks are finite."""
+    """Record the divergence, and keep the last policy whose networks are finite."""
     step = folder.take_last_checkpoint(env_id)
     kept = (
         "no policy was saved before" if step is None else f"the last policy is that of step {step}"
     )
     folder.write(
         status=Status.DIVERGED,
-        error=f"{error}. In {folder.path.name} {kept}",  # which other machines read, too
+        error=f"{error}. In {folder.path.name} {kept}",  # other machines read this too
         num_timesteps=model.num_timesteps,
         last_policy=step,
     )
@@ -57,18 +57,18 @@ def _diverged(folder: RunFolder, env_id: str, model: BaseAlgorithm, error: Diver
 
 def _how_to_resume(folder: RunFolder, model: BaseAlgorithm) -> str:
     if model.num_timesteps == 0:
-        return "Nothing was trained yet; free space or make it writable, and start again"
+        return "Nothing was trained yet; free space or make it writable, then start again"
     checkpoint = folder.last_checkpoint()
     kept = "from its start" if checkpoint is None else f"from step {checkpoint.name}"
     return (
         f"The run stopped at step {model.num_timesteps}. Free space or make the folder writable; "
-        f"then it goes on {kept}: {command('train', '--resume', folder)}"
+        f"then resume it {kept}: {command('train', '--resume', folder)}"
     )
 
 
 @contextmanager
 def diverging(model: BaseAlgorithm) -> Iterator[None]:
-    """Raise Diverged for whatever error networks that hold NaN cause within."""
+    """Raise Diverged in place of any error that occurs while the networks hold NaN."""
     try:
         yield
     except (SparsityError, StopTraining):

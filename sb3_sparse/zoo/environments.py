@@ -1,4 +1,4 @@
-"""Which environments there are, whose package brings one, and what is missing when one is not."""
+"""Finds environments, the packages that register them, and what to install if one is missing."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from sb3_sparse.policies.registry import registered
 
 
 def register_atari() -> bool:
-    """Register the Atari games where ale-py is installed; whether it is."""
+    """Register the Atari games if ale-py is installed, and return whether it is."""
     if importlib.util.find_spec("ale_py") is None:
         return False
     import ale_py
@@ -25,16 +25,16 @@ def register_atari() -> bool:
 
 
 def package_names(given: Any) -> tuple[str, ...]:
-    """Names of packages that register environments or algorithms.
+    """Return the names of packages that register environments or algorithms.
 
-    :param given: as ``--gym-packages`` and files give them: a name, a list of names, or None
-    :raises ConfigError: if it is something else
+    :param given: a name, a list of names, or None, as from ``--gym-packages`` or a file
+    :raises ConfigError: for anything else
     """
     names = [given] if isinstance(given, str) else [] if given is None else given
     if not isinstance(names, (list, tuple)) or not all(_is_module(name) for name in names):
         raise ConfigError(
             "gym_packages must be names of modules that register environments or algorithms, e.g. "
-            f"my_envs or my_envs.maze (no path of a file), got {given!r}"
+            f"my_envs or my_envs.maze (not a file path), got {given!r}"
         )
     return tuple(dict.fromkeys(names))
 
@@ -44,14 +44,14 @@ def _is_module(name: Any) -> bool:
 
 
 def plain_id(env_id: str, packages: Sequence[str] = ()) -> tuple[str, tuple[str, ...]]:
-    """An id without its package, and the packages with it.
+    """Separate an id from its package, and add that package to the others.
 
-    Gymnasium's ``package:Env-v0`` is ``Env-v0`` of a package that is imported first. Folders and
-    configs know the plain id.
+    Gymnasium imports the package of ``package:Env-v0`` before it makes ``Env-v0``. Folders and
+    configs use the plain id.
 
     :param env_id: e.g. ``"CartPole-v1"`` or ``"my_envs:Maze-v0"``
-    :param packages: that are imported anyway
-    :raises ConfigError: if what stands before the colon is no name of a module
+    :param packages: the other packages
+    :raises ConfigError: if the text before the colon is not the name of a module
     """
     package, colon, name = env_id.partition(":")
     if not colon:
@@ -66,10 +66,10 @@ def plain_id(env_id: str, packages: Sequence[str] = ()) -> tuple[str, tuple[str,
 def import_packages(names: Iterable[str]) -> None:
     """Import packages, so that they register their environments and algorithms.
 
-    :raises ConfigError: if one is not there, or fails
+    :raises ConfigError: if one is missing or raises
     """
     for name in names:
-        # The user's code may name SparsePolicy, whose registration the command line puts off.
+        # User code may name SparsePolicy, whose registration the command line defers.
         registered()
         try:
             importlib.import_module(name)
@@ -80,8 +80,8 @@ def import_packages(names: Iterable[str]) -> None:
             here = root.is_dir() or root.with_suffix(".py").is_file()
             raise ConfigError(
                 f"there is no package {name!r} to import environments or algorithms from; install "
-                "it, or put the folder that it lies in on PYTHONPATH"
-                + (" (it lies in this one: PYTHONPATH=. before the command)" if here else "")
+                "it, or put the folder that contains it on PYTHONPATH"
+                + (" (the current one does: put PYTHONPATH=. before the command)" if here else "")
             ) from error
         except Exception as error:
             raise _failed(name, error) from error
@@ -92,9 +92,9 @@ def _failed(name: str, error: Exception) -> ConfigError:
 
 
 def known_environment(env_id: str) -> None:
-    """Refuse an environment that is not there.
+    """Raise if an environment does not exist.
 
-    :raises ConfigError: if Gymnasium has none of this id
+    :raises ConfigError: if Gymnasium has no environment of this id
     :raises MissingExtra: if it is an Atari game, and ale-py or OpenCV is not installed
     """
     has_atari = register_atari()
@@ -104,13 +104,13 @@ def known_environment(env_id: str) -> None:
         raise ConfigError(
             f"unknown environment {env_id!r}"
             + (did_you_mean(env_id, gym.registry) or "; give a Gymnasium id")
-            + "; --gym-packages names a module that registers environments of your own"
+            + "; --gym-packages names a module that registers your own environments"
             + ("" if has_atari else " (Atari games need sb3-sparse[atari])")
         )
 
 
 def is_atari(env_id: str) -> bool:
-    """Whether it is an Atari game, told as rl-zoo tells it."""
+    """Whether an environment is an Atari game, by rl-zoo's rule."""
     return "AtariEnv" in str(gym.registry[env_id].entry_point)
 
 
@@ -132,13 +132,13 @@ MUJOCO = (
 
 
 def game_of(env_id: str) -> str:
-    """Name of a task without its version, e.g. ``"Pong"`` of ``"ALE/Pong-v5"``."""
+    """Return a task's name without its version, e.g. ``"Pong"`` for ``"ALE/Pong-v5"``."""
     name = re.sub(r"-v\d+$", "", env_id.split("/")[-1])
     return re.sub(r"(-ram)?(NoFrameskip|Deterministic)?$", "", name)
 
 
 def suite_of(env_id: str) -> str:
-    """The benchmark that a task belongs to, told by its name: it need not be registered."""
+    """Return a task's benchmark by its name; the task need not be registered."""
     if env_id.startswith("ALE/") or "NoFrameskip" in env_id or "Deterministic" in env_id:
         return ATARI
     if game_of(env_id) in CLASSIC_CONTROL:

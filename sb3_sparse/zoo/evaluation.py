@@ -1,4 +1,4 @@
-"""Evaluation while training: SB3's, but on time after a resume and with no best that is dense."""
+"""EvalCallback that stays on schedule after a resume and never keeps a too-dense best model."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ CURE = (
 class Evaluated:
     """The evaluations in a checkpoint.
 
-    :param best_mean_reward: of the best model
+    :param best_mean_reward: mean return of the best model
     :param timesteps: environment steps before each evaluation
-    :param results: returns of its episodes
-    :param lengths: steps of its episodes
-    :param successes: of its episodes, where the environment tells
+    :param results: episode returns of each evaluation
+    :param lengths: episode lengths in steps
+    :param successes: whether each episode succeeded, where the environment reports it
     """
 
     best_mean_reward: float
@@ -53,7 +53,7 @@ class Evaluated:
 
     @classmethod
     def read(cls, folder: Path) -> Evaluated:
-        """Read them, and see that the best model is whole.
+        """Read a checkpoint's evaluations, and check that its best model is intact.
 
         :raises ConfigError: if a file is missing
         :raises CorruptStateError: if a file is damaged
@@ -75,27 +75,27 @@ class Evaluated:
         saved = read_arrays(path, what, CURE, needed)
         steps, *episodes = (saved[name].shape for name in needed)
         if steps != (count,) or any(one[:1] != steps or len(one) != 2 for one in episodes):
-            raise CorruptStateError(f"{path} is damaged: it has not {count} evaluations; {CURE}")
+            raise CorruptStateError(f"{path} is damaged: it lacks {count} evaluations; {CURE}")
         names = (*needed, "successes")
         return cls(best, *(saved[name].tolist() for name in names if name in saved))
 
 
 class Evaluation(EvalCallback):
-    """SB3's EvalCallback at fixed environment steps; goes on where an interrupted run was.
+    """SB3's EvalCallback at fixed environment steps, which continues after an interruption.
 
-    Networks that hold NaN are not evaluated: the training ends with
+    Networks that hold NaN are not evaluated: training ends with
     :class:`~sb3_sparse.errors.Diverged`.
 
-    ``best_model.zip`` is the best policy of the sparsity asked for: while pruning is under way,
-    policies are evaluated and logged but not kept.
+    ``best_model.zip`` is the best policy at the requested sparsity: during pruning, policies
+    are evaluated and logged but not kept.
 
-    :param eval_env: environments of the evaluation
-    :param folder: where ``evaluations.npz`` and ``best_model.zip`` go
+    :param eval_env: environments to evaluate in
+    :param folder: folder of ``evaluations.npz`` and ``best_model.zip``
     :param every: environment steps between two evaluations
     :param episodes: episodes of one evaluation
     :param deterministic: whether the policy acts deterministically
-    :param on_new_best: called when there is a new best model
-    :param watch: is told of each evaluation
+    :param on_new_best: called after each new best model
+    :param watch: notified of each evaluation
     :param after_each: called after each evaluation
     """
 
@@ -115,7 +115,7 @@ class Evaluation(EvalCallback):
             callback_on_new_best=on_new_best,
             callback_after_eval=after_each,
             n_eval_episodes=episodes,
-            eval_freq=1,  # whenever _on_step below lets it
+            eval_freq=1,  # _on_step below decides when
             log_path=str(folder / UNFINISHED),
             best_model_save_path=str(folder / UNFINISHED),
             deterministic=deterministic,
@@ -127,11 +127,11 @@ class Evaluation(EvalCallback):
 
     @property
     def count(self) -> int:
-        """Evaluations done."""
+        """Number of evaluations so far."""
         return len(self.evaluations_timesteps)
 
     def save(self, folder: Path) -> None:
-        """Save the evaluations so far, and the best model by them."""
+        """Save the evaluations so far and the best model."""
         state = {"best_mean_reward": self.best_mean_reward, "count": self.count}
         (folder / STATE).write_text(json.dumps(state))
         for name in (EVALUATIONS, BEST):
@@ -139,14 +139,14 @@ class Evaluation(EvalCallback):
                 shutil.copy(self.folder / name, folder / name)
 
     def forget(self) -> None:
-        """Remove what a run that is started anew has evaluated before."""
+        """Remove the earlier evaluations of a run that starts anew."""
         for name in (EVALUATIONS, BEST):
             (self.folder / name).unlink(missing_ok=True)
 
     def restore(self, folder: Path) -> None:
-        """Take back what :meth:`save` saved; what was evaluated after that is forgotten.
+        """Restore what :meth:`save` saved, and drop all later evaluations.
 
-        :raises CorruptStateError: if something of it is damaged; then all stays as it is
+        :raises CorruptStateError: if a file is damaged; nothing is changed then
         """
         saved = Evaluated.read(folder)
         for name in (EVALUATIONS, BEST):
@@ -194,7 +194,7 @@ class Evaluation(EvalCallback):
 
     @contextmanager
     def _whole_files(self) -> Iterator[None]:
-        """Replace best model and evaluations once they are written, so that a full disk cannot."""
+        """Replace best model and evaluations only by complete files, even if the disk fills up."""
         new = self.folder / UNFINISHED
         new.mkdir(exist_ok=True)
         try:

@@ -1,4 +1,4 @@
-"""The folder of a run, as rl-zoo lays it out: its one owner."""
+"""The folder of a run, in rl-zoo's layout: one class reads and writes it."""
 
 from __future__ import annotations
 
@@ -32,21 +32,21 @@ EXAMPLE = "logs/sac/HalfCheetah-v5_1"
 OF_ENVIRONMENT = ("env_wrapper", "vec_env_wrapper", "frame_stack", "env_kwargs", "normalize")
 """The settings that decide how a run's environments are made."""
 RESTORE = "restore it, or copy the zip out of the folder and give it with --env and --vecnormalize"
-PATIENCE = 1.0  # seconds; others hold the lock for a moment to see whether it is free
+PATIENCE = 1.0  # seconds; other processes hold the lock briefly to test it
 
 
 def env_name(env_id: str) -> str:
-    """An environment's id as files and folders have it: ``"ALE-Pong-v5"`` for ``"ALE/Pong-v5"``."""
+    """Return an environment's id for file names: ``"ALE-Pong-v5"`` for ``"ALE/Pong-v5"``."""
     return env_id.replace("/", "-")
 
 
 @dataclass(frozen=True)
 class Start:
-    """Where a process takes a run up.
+    """The point from which a process starts or resumes a run.
 
-    :param folder: holds the model to load: a checkpoint or the run's own folder; None: a new model
+    :param folder: folder of the model to load, a checkpoint or the run's; None: a new model
     :param steps: environment steps done
-    :param trained: whether only the last evaluation is left
+    :param trained: whether only the final evaluation is left
     """
 
     folder: Path | None = None
@@ -59,9 +59,9 @@ class RunFolder:
     """A run's folder, and the only reader and writer of its ``sparsity.json``.
 
     It holds ``<env>.zip`` (the last policy), ``best_model.zip``, ``evaluations.npz``,
-    ``<env>/config.yml``, ``<env>/args.yml`` and ``<env>/vecnormalize.pkl`` as of ``rl_zoo3.train``,
-    ``sparsity.json``, and, until the run is over, its checkpoint in ``resume/<steps>``. Nothing is
-    read or written before a method is called.
+    ``<env>/config.yml``, ``<env>/args.yml`` and ``<env>/vecnormalize.pkl`` as ``rl_zoo3.train``
+    writes them, ``sparsity.json`` and, until the run ends, its checkpoint in ``resume/<steps>``.
+    Constructing a RunFolder reads and writes nothing.
 
     Example::
 
@@ -72,7 +72,7 @@ class RunFolder:
         if folder.has_record:
             print(folder.record().status, folder.record()["total"]["sparsity"])
 
-    :param path: e.g. ``Path("logs/dqn/CartPole-v1_1")``
+    :param path: the folder, e.g. ``Path("logs/dqn/CartPole-v1_1")``
     """
 
     path: Path
@@ -89,7 +89,7 @@ class RunFolder:
             numbers = (one.name.removeprefix(f"{name}_") for one in parent.glob(f"{name}_*"))
             taken = [int(number) for number in numbers if number.isdigit()]
             path = parent / f"{name}_{max(taken, default=0) + 1}"
-            with suppress(FileExistsError):  # another run was quicker
+            with suppress(FileExistsError):  # another run was faster
                 path.mkdir()
                 return cls(path)
 
@@ -101,7 +101,7 @@ class RunFolder:
         return (self.path / NAME).is_file()
 
     def record(self) -> Record:
-        """The content of ``sparsity.json``.
+        """Read ``sparsity.json``.
 
         :raises ConfigError: if the folder has none
         :raises CorruptStateError: if it is damaged
@@ -115,22 +115,22 @@ class RunFolder:
         return Record(read_json(path, WHAT, CURE), path)
 
     def write(self, **content: Any) -> None:
-        """Write ``sparsity.json``, whole or not at all. Entries of other names stay."""
+        """Update entries of ``sparsity.json``, writing the file completely or not at all."""
         path = self.path / NAME
         known = read_json(path, WHAT, CURE) if self.has_record else {"format": FORMAT}
         with written_whole(path) as new:
             new.write_text(as_json({**known, **content}))
 
-    # The models, and what belongs to them.
+    # The models and their files.
 
     @property
     def is_run(self) -> bool:
-        """Whether this is the folder of a run, of ``sb3-sparse train`` or ``rl_zoo3.train``."""
+        """Whether ``sb3-sparse train`` or ``rl_zoo3.train`` made this folder for a run."""
         return len(list(self.path.glob(f"*/{ARGUMENTS}"))) == 1
 
     @property
     def evaluations(self) -> Path:
-        """The evaluations during training."""
+        """The file of the evaluations during training."""
         return self.path / EVALUATIONS
 
     def parameters(self, env_id: str) -> Path:
@@ -138,23 +138,23 @@ class RunFolder:
         return self.path / env_name(env_id)
 
     def model(self, env_id: str, best: bool = False) -> Path:
-        """The last or best policy.
+        """Return the file of the last or the best policy.
 
-        :raises ConfigError: if there is none
+        :raises ConfigError: if there is no such file
         """
         path = self.path / (BEST if best else f"{env_name(env_id)}.zip")
         if not path.is_file():
             models = ", ".join(sorted(file.name for file in self.path.glob("*.zip"))) or "none"
             why = (
-                "there is a best policy after the first evaluation at the sparsity asked for"
+                "a best policy exists after the first evaluation at the requested sparsity"
                 if best
-                else "a run that was killed has its last policy after sb3-sparse train --resume"
+                else "a killed run gets its last policy from sb3-sparse train --resume"
             )
             raise ConfigError(f"{self} has no {path.name} (its models: {models}): {why}")
         return path
 
     def arguments(self) -> dict[str, Any]:
-        """What the run was started with, from the file that rl-zoo writes.
+        """Read the arguments that the run was started with, from rl-zoo's file.
 
         :raises ConfigError: if there is no run
         :raises CorruptStateError: if the file is damaged
@@ -183,15 +183,15 @@ class RunFolder:
         return arguments
 
     def _check_compression(self) -> None:
-        """Tell the folder of ``sb3-sparse compress`` from that of a run."""
+        """Raise if this folder is one of ``sb3-sparse compress``."""
         path = self.path / "compress.json"
         if not path.is_file():
             return
-        cure = "give its command again with another --out"
+        cure = "repeat its command with another --out"
         if read_json(path, "record of a compression", cure).get("finished"):
-            raise ConfigError(f"{self} is no run's folder; give the zip in it")
+            raise ConfigError(f"{self} is not a run's folder; give the zip in it")
         raise ConfigError(
-            f"the compression in {self} is not finished; give its command again, and it goes on"
+            f"the compression in {self} is not finished; repeat its command to continue it"
         )
 
     # The lock and the checkpoints.
@@ -202,14 +202,14 @@ class RunFolder:
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Keep other processes from training the run within.
+        """Keep other processes from training the run.
 
-        :raises RunBusy: if one does already
-        :raises Unwritable: if the folder cannot be written to
+        :raises RunBusy: if another process trains it already
+        :raises Unwritable: if the folder is not writable
         """
         lock = FileLock(self._lock)
         try:
-            with writing(self.path, "free space or make it writable, and give the command again"):
+            with writing(self.path, "free space or make it writable, then repeat the command"):
                 lock.acquire(timeout=PATIENCE)
         except Timeout as error:
             raise RunBusy(f"another process is at work in {self}") from error
@@ -221,7 +221,7 @@ class RunFolder:
             lock.release()
 
     def is_locked(self) -> bool:
-        """Whether some process trains the run now; nothing is written."""
+        """Whether a process is training the run; the check writes nothing."""
         try:
             descriptor = os.open(self._lock, os.O_RDONLY)
         except FileNotFoundError:
@@ -233,16 +233,16 @@ class RunFolder:
 
     @property
     def checkpoints(self) -> Path:
-        """The folder of checkpoints, each called by its environment steps."""
+        """The folder of checkpoints, each named after its environment steps."""
         return self.path / "resume"
 
     def last_checkpoint(self) -> Path | None:
-        """The newest whole checkpoint; None if there is none."""
+        """Return the newest complete checkpoint, or None."""
         found = [path for path in self.checkpoints.glob("*") if path.name.isdigit()]
         return max(found, key=lambda path: int(path.name), default=None)
 
     def start(self) -> Start:
-        """Where the run resumes."""
+        """Return the point from which the run resumes."""
         if self.record().get("trained"):
             return Start(self.path, trained=True)
         checkpoint = self.last_checkpoint()
@@ -263,14 +263,14 @@ class RunFolder:
         return int(checkpoint.name)
 
     def clear_checkpoints(self) -> None:
-        """Remove what only an interrupted run needs."""
+        """Remove the checkpoints, which only an interrupted run needs."""
         shutil.rmtree(self.checkpoints, ignore_errors=True)
 
     def clear_leftovers(self) -> None:
-        """Remove what a run without a record left, unless some process is at it."""
+        """Remove the files of a run without a record, unless a process is training it."""
         self.path.mkdir(parents=True, exist_ok=True)
         with self.locked():
-            if self.has_record:  # it has begun since
+            if self.has_record:  # it has started since
                 return
             for path in self.path.iterdir():
                 if path.is_dir():
@@ -280,7 +280,7 @@ class RunFolder:
 
 
 def environment_in(arguments: Mapping[str, Any]) -> tuple[str | None, tuple[str, ...]]:
-    """The environment's plain id in a run's arguments, and the modules that register it.
+    """Return the environment's plain id in a run's arguments, and the modules that register it.
 
     :param arguments: as :meth:`RunFolder.arguments` returns them
     """
@@ -290,17 +290,17 @@ def environment_in(arguments: Mapping[str, Any]) -> tuple[str | None, tuple[str,
 
 
 def environment_settings(parameters: Path) -> dict[str, Any]:
-    """How a run's environments are made: wrappers, stacking, arguments, whether normalised.
+    """Read how a run's environments are made: wrappers, stacking, arguments, normalisation.
 
     :param parameters: folder of the run's ``config.yml``
-    :return: those of :data:`OF_ENVIRONMENT` that the file has, ``normalize`` as a truth value
+    :return: the settings of :data:`OF_ENVIRONMENT` that the file has, ``normalize`` as a bool
     :raises ConfigError: if there is no such file
-    :raises CorruptStateError: if it is damaged
+    :raises CorruptStateError: if the file is damaged
     """
     path = parameters / CONFIG
     if not path.is_file():
         raise ConfigError(
-            f"{path} is missing, which says how the run's environment was wrapped, stacked and "
+            f"{path} is missing, which records how the run's environment was wrapped, stacked and "
             f"normalised; {RESTORE}"
         )
     content = read_zoo_yaml(path, RESTORE)
@@ -324,7 +324,7 @@ def environment_settings(parameters: Path) -> dict[str, Any]:
 
 
 def zip_path(path: Path) -> Path:
-    """The path with the suffix that SB3 adds, where it was left out."""
+    """Add the suffix that SB3 adds, if the path lacks one and the file exists."""
     if not path.name or path.suffix:
         return path
     with_suffix = path.with_suffix(".zip")
@@ -336,7 +336,7 @@ def _names(value: Any) -> bool:
 
 
 def _wrappers(value: Any) -> bool:
-    """Whether it is a dotted path, a path with its arguments, or a list of these."""
+    """Whether a value is a dotted path, a path with its arguments, or a list of these."""
     return all(
         isinstance(one, str)
         or (_names(one) and len(one) == 1 and all(_names(given) for given in one.values()))
@@ -357,7 +357,7 @@ def _can_lock(descriptor: int) -> bool:
     import fcntl
 
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)  # gone when it is closed
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)  # released when the file closes
     except BlockingIOError:
         return False
     return True

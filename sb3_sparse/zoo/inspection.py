@@ -1,4 +1,4 @@
-"""Looking into a saved model without running anything that its file says."""
+"""Inspects a saved model without running code that its file names."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from sb3_sparse.zoo.saved import locate
 
 @dataclass(frozen=True)
 class Inspection:
-    """What a saved model is.
+    """The content of a saved model.
 
-    :param report: its layers. How each of them computes is that of the run where the run's record
-        says it, else as the model was made, on this machine's processor
-    :param compute: what it was made with
-    :param computing: what the run's record says of how it computed; None: nothing, or no record
+    :param report: its layers. How each computes comes from the run's record if it has that, else
+        from the model's settings and this machine's processor
+    :param compute: the policy's ``compute`` argument
+    :param computing: how the run computed, from its record; None: not known
     """
 
     report: SparsityReport
@@ -36,8 +36,8 @@ class Inspection:
 
     def _remarks(self) -> list[str]:
         if self.computing is not None:
-            sittings = [f"Trained {sitting}." for sitting in self.computing.sittings]
-            return [f"The run asked for compute={self.computing.asked!r}.", *sittings]
+            sessions = [f"Trained {session}." for session in self.computing.sittings]
+            return [f"The run asked for compute={self.computing.asked!r}.", *sessions]
         sparse = sum(layer.compute == SPARSE for layer in self.report.layers)
         if self.compute != "auto":
             return [f"The model was made with compute={self.compute!r}."]
@@ -48,16 +48,16 @@ class Inspection:
 
 
 def inspect_model(path: Path, best: bool = False) -> Inspection:
-    """The sparsity report of a saved model, and how its layers compute.
+    """Report the sparsity of a saved model, and how its layers compute.
 
-    Nothing is unpickled and no class that the file names is imported, so that a stranger's file can
-    be looked into.
+    Nothing is unpickled and no class that the file names is imported, so you can inspect files
+    that you do not trust.
 
-    :param path: a run's folder, or a zip that SB3 saved, whichever algorithm trained it
-    :param best: of a folder, the best policy instead of the last
-    :raises ConfigError: if there is no such file, or no sparse policy in it
-    :raises CorruptStateError: if the file is damaged, or the run's record
-    :raises Diverged: if the network is not finite
+    :param path: a run's folder, or a zip that SB3 saved, with any algorithm
+    :param best: take a folder's best policy instead of its last
+    :raises ConfigError: if there is no such file, or it holds no sparse policy
+    :raises CorruptStateError: if the file or the run's record is damaged
+    :raises Diverged: if a network is not finite
     """
     path, folder = locate(path, best)
     computing, recorded = None, {}
@@ -84,9 +84,9 @@ def inspect_model(path: Path, best: bool = False) -> Inspection:
 def _sparse(
     compute: str, outline: Outline, policy_class: object, kwargs: Mapping[str, Any]
 ) -> set[str]:
-    """Names of the layers in sparse storage when the model is loaded.
+    """Return the names of the layers that a loaded model keeps in sparse storage.
 
-    :param policy_class: what the file says of it
+    :param policy_class: the policy's class as the file writes it
     :param kwargs: the policy's arguments
     """
     names = {layer.name for layer in outline.layers}
@@ -100,7 +100,7 @@ def _sparse(
 
 
 def _known(written: object) -> bool:
-    """Whether a class, as a file writes it, is one that only calls its layers; None: the usual."""
+    """Whether a class in a file is known to only call its layers; None is the default class."""
     module = written.get("__module__") if isinstance(written, dict) else written
     if not isinstance(module, str):
         return True

@@ -40,10 +40,10 @@ class RunManager(ExperimentManager):
 
     :param run: what to train
     :param settings: the settings to train it with
-    :param folder: the run's own folder
+    :param folder: the run's folder
     :param evaluation: ``eval_freq`` and ``eval_episodes``
-    :param start: where to take the run up
-    :param tensorboard_log: folder of TensorBoard's files; empty: none
+    :param start: the point from which to start or resume
+    :param tensorboard_log: folder for TensorBoard; empty: none
     """
 
     def __init__(
@@ -93,10 +93,10 @@ class RunManager(ExperimentManager):
         return self.settings.as_dict(), OrderedDict(sorted(self.settings.as_dict().items()))
 
     def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
-        """As rl-zoo makes them, but the episodes of a run that is trained stay on record.
+        """Make environments as rl-zoo does, without overwriting the episodes of a trained run.
 
-        Evaluation has the environment's arguments from the settings too, which rl-zoo gives to
-        training alone.
+        Evaluation gets the environment arguments in the settings too; rl-zoo gives them to training
+        alone.
         """
         self.eval_env_kwargs = self.env_kwargs
         with mujoco_warns_once(self.env_name.gym_id):
@@ -104,9 +104,9 @@ class RunManager(ExperimentManager):
         return envs
 
     def setup(self) -> BaseAlgorithm:
-        """The model, new or as the checkpoint has it, with its environment.
+        """Make the model, or load it from the checkpoint, with its environment.
 
-        The steps are those of rl-zoo's ``setup_experiment``, which knows stock algorithms only.
+        The steps are those of rl-zoo's ``setup_experiment``, which supports stock algorithms only.
         """
         with quiet():
             hyperparams, saved = self.read_hyperparameters()
@@ -135,7 +135,7 @@ class RunManager(ExperimentManager):
             "device": self.device,
         }
         if self.continue_training:
-            for name in ("policy", "policy_kwargs"):  # the file has them
+            for name in ("policy", "policy_kwargs"):  # the file holds them
                 kwargs.pop(name, None)
             model: BaseAlgorithm = algorithm.load(self.trained_agent, **kwargs)
         else:
@@ -147,8 +147,8 @@ class RunManager(ExperimentManager):
         folder = self.start.folder / REPLAY_BUFFER
         if not folder.is_dir():
             warn(
-                f"there is no replay buffer in {folder}: the run goes on with an empty one, which "
-                "trains otherwise than an uninterrupted run"
+                f"there is no replay buffer in {folder}: the run continues with an empty one, and "
+                "so differs from an uninterrupted run"
             )
             self.folder.write(without_buffer_from=model.num_timesteps)
             return
@@ -157,27 +157,27 @@ class RunManager(ExperimentManager):
         end_episodes(model.replay_buffer)
 
     def save(self, model: BaseAlgorithm) -> Path:
-        """Save the model as rl-zoo does; where."""
+        """Save the model as rl-zoo does, and return its file."""
         with quiet():
             self.save_trained_model(model)
         return Path(self.save_path) / f"{self.env_name}.zip"
 
     def evaluation_envs(self, count: int, seed: int) -> VecEnv:
-        """Environments of their own for evaluation, with training's normalisation."""
+        """Make separate environments for evaluation, with training's normalisation."""
         with quiet():
             envs: VecEnv = self.create_envs(count, eval_env=True)
         envs.seed(seed)
         return envs
 
     def keep_normalization(self) -> BaseCallback:
-        """Saves the normalisation beside a new best model."""
+        """Return a callback that saves the normalisation with each new best model."""
         callback: BaseCallback = SaveVecNormalizeCallback(save_freq=1, save_path=self.params_path)
         return callback
 
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Swallow what rl_zoo3 prints; if it fails, the error says more."""
+    """Hide what rl_zoo3 prints; its errors say more."""
     with redirect_stdout(io.StringIO()):
         yield
 
@@ -185,7 +185,7 @@ def quiet() -> Iterator[None]:
 def spaces_of(
     run: RunSpec, settings: Settings, folder: RunFolder, evaluation: Mapping[str, int]
 ) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
-    """Observation and action space that the policy sees, wrappers and stacking included."""
+    """Return the policy's observation and action spaces, wrappers and stacking included."""
     experiment = RunManager(run, settings, folder, evaluation)
     with quiet():
         hyperparams, _ = experiment.read_hyperparameters()
@@ -198,10 +198,10 @@ def spaces_of(
 
 
 def loadable_algorithms() -> dict[str, type[BaseAlgorithm]]:
-    """Algorithms that a run can be of, those of rl-zoo without a sparse policy too."""
+    """Return all algorithms that can be loaded, including those without a sparse policy."""
     return {**ALGOS, **algorithms()}
 
 
 def load_for_prediction(algo: str, path: Path) -> BaseAlgorithm:
-    """A saved model without its replay buffer."""
+    """Load a saved model without its replay buffer."""
     return load_without_buffer(loadable_algorithms()[algo], path)

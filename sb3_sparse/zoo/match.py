@@ -1,4 +1,4 @@
-"""The dense network with as many parameters as a sparse one has."""
+"""Builds the dense network with as many parameters as a sparse one."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ OF_EXTRACTOR = ("channels", "features_dim")
 
 @dataclass(frozen=True)
 class Match:
-    """The outcome.
+    """A dense network that matches the parameter count of a sparse one.
 
-    :param sparsity: whose parameter count was matched
-    :param target: that count: active connections and biases
+    :param sparsity: sparsity of the network that was matched
+    :param target: its parameter count: active connections and biases
     :param achieved: parameters of the dense network
     :param policy_kwargs: the policy's arguments with the scaled widths
     """
@@ -58,9 +58,9 @@ def match_parameters(
 ) -> Match:
     """Scale all hidden widths (channels and dense units of an image network too) by one factor.
 
-    :param settings: of the dense network in full width
-    :param sparsity: of the network to match, in [0, 1)
-    :raises ConfigError: if the settings do not say how wide the network is
+    :param settings: settings of the dense network at full width
+    :param sparsity: sparsity of the network to match, in [0, 1)
+    :raises ConfigError: if the settings do not give the network's widths
     """
     kwargs = _with_widths(settings.policy_kwargs, observation_space)
     hidden = [int(container[key]) for container, key in _places(kwargs)]
@@ -88,7 +88,7 @@ def untrained_policy(
     action_space: spaces.Space[Any],
     settings: Settings,
 ) -> BaseSparsePolicy:
-    """A policy as the algorithm would make it from these settings, to be looked at."""
+    """Make the policy that the algorithm would make from these settings."""
     kwargs = settings.policy_kwargs
     if settings.get("use_sde"):
         kwargs["use_sde"] = True
@@ -99,7 +99,7 @@ def untrained_policy(
 
 
 def _with_widths(policy_kwargs: Mapping[str, Any], space: spaces.Space[Any]) -> dict[str, Any]:
-    """The arguments with every width written out."""
+    """Return the arguments with every width written out."""
     kwargs = deepcopy(dict(policy_kwargs))
     if "net_arch" not in kwargs:
         raise ConfigError(
@@ -114,9 +114,9 @@ def _with_widths(policy_kwargs: Mapping[str, Any], space: spaces.Space[Any]) -> 
 
 
 def _places(kwargs: dict[str, Any]) -> Iterator[tuple[Any, Any]]:
-    """Where each hidden width stands: of net_arch, then of an image network.
+    """Yield the place of each hidden width: those of net_arch, then those of an image network.
 
-    :return: list and index, or mapping and name
+    :return: pairs of a list and an index, or of a mapping and a name
     """
     arch = kwargs["net_arch"]
     extractor = kwargs.get(EXTRACTOR_KWARGS, {})

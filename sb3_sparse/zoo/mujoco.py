@@ -1,4 +1,4 @@
-"""MuJoCo says the same of Gymnasium's models each time one is made; here it says it once."""
+"""Prints MuJoCo's warnings about Gymnasium's models once, not each time a model is made."""
 
 from __future__ import annotations
 
@@ -15,18 +15,17 @@ _said: set[str] = set()
 
 @contextmanager
 def mujoco_warns_once(env_id: str) -> Iterator[None]:
-    """Within it, each of MuJoCo's warnings is printed once a process, and none goes to a file.
+    """Print each of MuJoCo's warnings once per process, and write none to a file.
 
-    Otherwise it prints them all and writes ``MUJOCO_LOG.TXT`` into the current folder. Afterwards
-    it does so again.
+    Outside, MuJoCo prints them all and writes ``MUJOCO_LOG.TXT`` into the current folder.
 
-    :param env_id: what is made; only for Gymnasium's own MuJoCo tasks, and where MuJoCo is loaded
-        already, is it asked for
+    :param env_id: environment to make; MuJoCo is imported only if this is one of Gymnasium's own
+        MuJoCo tasks
     """
     entry_point = str(getattr(gym.registry.get(env_id), "entry_point", ""))
     mujoco: Any = sys.modules.get("mujoco")
     if mujoco is None and "mujoco" in entry_point:
-        with suppress(ImportError):  # Gymnasium says what is missing
+        with suppress(ImportError):  # Gymnasium reports what is missing
             mujoco = import_module("mujoco")
     if mujoco is None:
         yield

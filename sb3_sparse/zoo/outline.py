@@ -1,4 +1,4 @@
-"""A sparse policy's layers, told by its state_dict alone: no code of the file's is run."""
+"""Reads a sparse policy's layers from its state_dict alone, running no code of the file."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ from sb3_sparse.zoo.positions import positions_of
 WEIGHT, MASK, BIAS = ".weight", ".weight_mask", ".bias"
 CONVOLUTIONS = {3: nn.Conv1d, 4: nn.Conv2d, 5: nn.Conv3d}
 SQUASHED = "actor.mu."
-"""TD3's actor, and one with gSDE, end in an activation though they are an output."""
+"""Output layers of TD3's actor and of actors with gSDE, which an activation follows."""
 
 IMPALA_BLOCK = ".layers."
 
 
 @dataclass(frozen=True)
 class Outline:
-    """What a state_dict tells of a policy.
+    """A policy as its state_dict describes it.
 
-    :param report: its layers, all of them dense or masked, as a state_dict stores them; FLOPs of a
-        convolution are 0 where its strides are not known
-    :param root: modules of the same names and shapes, with activations between
-    :param layers: those within the budget
+    :param report: its layers, all dense or masked, as a state_dict stores them; a convolution's
+        FLOPs are 0 if its strides are unknown
+    :param root: modules of the same names and shapes, with activations in between
+    :param layers: the layers within the budget
     """
 
     report: SparsityReport
@@ -44,13 +44,13 @@ class Outline:
 
 
 def outline_of(state: Mapping[str, Any], image: tuple[int, ...] | None, where: str) -> Outline:
-    """The layers of a sparse policy.
+    """Reconstruct the layers of a sparse policy.
 
     :param state: its state_dict
     :param image: shape of the images that it observes, channels first; None: it observes none
-    :param where: what to call the model in an error
+    :param where: the model's name in messages
     :raises ConfigError: if the policy is not sparse
-    :raises CorruptStateError: if a layer can have no such name or shape
+    :raises CorruptStateError: if a layer has an impossible name or shape
     """
     state = plain_names(state)
     specs = _specs(state)
@@ -97,7 +97,7 @@ def outline_of(state: Mapping[str, Any], image: tuple[int, ...] | None, where: s
 
 
 def _specs(state: Mapping[str, Any]) -> Mapping[str, NetworkSpec]:
-    """The networks of the first algorithm whose policy keeps its layers where the state does."""
+    """Return the networks of the first algorithm whose policy has the state's layer names."""
     for one in registered().values():
         specs = one.policy.networks
         if all(any(_below(key, spec.roots) for key in state) for spec in specs.values()):
@@ -110,7 +110,7 @@ def _below(name: str, roots: tuple[str, ...]) -> bool:
 
 
 def _networks(state: Mapping[str, Any], specs: Mapping[str, NetworkSpec]) -> dict[str, str]:
-    """Names of the layers and of their networks, each weight once, targets left out."""
+    """Map layers to networks by name, with each weight once and without targets."""
     names = [
         key.removesuffix(WEIGHT)
         for key, value in state.items()
@@ -124,21 +124,21 @@ def _networks(state: Mapping[str, Any], specs: Mapping[str, NetworkSpec]) -> dic
                 if _below(name + WEIGHT, (root,)) and (one := _identity(state, name)) not in seen:
                     seen.add(one)
                     found[name] = network
-    for name in names:  # of a policy with networks of its own
+    for name in names:  # layers in a custom policy's own networks
         if name + MASK in state and _identity(state, name) not in seen:
             found[name] = name.split(".")[0]
     return {name: one for name, one in found.items() if not in_target(name, specs)}
 
 
 def _identity(state: Mapping[str, Any], name: str) -> tuple[str, bytes]:
-    """What a layer of a shared features extractor has in common under all of its names."""
+    """Return a key that a shared features extractor's layer has under all of its names."""
     within = name.rpartition("features_extractor.")[2]  # the whole name of any other layer
     weight = state[name + WEIGHT].detach().contiguous()
     return within, sha256(weight.numpy().tobytes()).digest()
 
 
 def _activated(name: str, state: Mapping[str, Any], specs: Mapping[str, NetworkSpec]) -> bool:
-    """Whether an activation follows a layer: it has no parameters, so its number is missing."""
+    """Whether an activation, which has no parameters, takes the number after a layer's."""
     module, _, number = name.rpartition(".")
     if not number.isdigit():
         return False
@@ -156,13 +156,13 @@ def _activated(name: str, state: Mapping[str, Any], specs: Mapping[str, NetworkS
 
 
 def _number(key: str, module: str) -> int:
-    """The number of a key's part of a Sequential; -1 if it is not in it."""
+    """Return the number of a key's module in a Sequential; -1 if it is not in it."""
     rest = key.removeprefix(f"{module}.").split(".")[0] if key.startswith(f"{module}.") else ""
     return int(rest) if rest.isdigit() else -1
 
 
 def _place(root: nn.Module, name: str, weight: th.Tensor, bias: bool) -> Prunable:
-    """Put a layer of a weight's shape under its dotted name."""
+    """Add a layer with a weight under its dotted name."""
     *path, last = name.split(".")
     for part in path:
         if part not in dict(root.named_children()):
@@ -182,7 +182,7 @@ def _place(root: nn.Module, name: str, weight: th.Tensor, bias: bool) -> Prunabl
 
 
 def _fill(root: nn.Module) -> None:
-    """Make modules of numbered children Sequentials, with an activation where a number lacks."""
+    """Turn modules with numbered children into Sequentials, with an activation in each gap."""
     for name, child in list(root.named_children()):
         _fill(child)
         numbers = [int(part) for part, _ in child.named_children() if part.isdigit()]

@@ -39,7 +39,7 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc]
             if key in first:
                 cure = "give a list, <<: [*a, *b]" if key == "<<" else "keep one"
                 raise ConfigError(
-                    f"the key {key!r} stands in line {first[key]} and again in line {line}; {cure}"
+                    f"the key {key!r} is in line {first[key]} and again in line {line}; {cure}"
                 )
             first[key] = line
 

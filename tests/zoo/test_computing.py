@@ -17,7 +17,7 @@ from sb3_sparse.engine.native import library
 from sb3_sparse.errors import CorruptStateError
 from sb3_sparse.zoo.computing import (
     Computing,
-    Sitting,
+    Session,
     computing_at,
     computing_in,
     gradient_steps_of,
@@ -34,7 +34,7 @@ NAMES = ["q_net.q_net.0", "q_net.q_net.2", "q_net.q_net.4"]
 """4-200-200-2: 40,000 connections in the middle, so one chain of layers that may be sparse."""
 
 
-SITTING = dict(
+SESSION = dict(
     num_timesteps=0, instructions=None, torch_instructions="", threads=1, layers={},
 )  # fmt: skip
 
@@ -65,8 +65,8 @@ def test_the_record_says_what_was_asked_for_and_what_decides_rounding(trained):
     found = computing_in(RunFolder(trained).record())
     sparse = dict.fromkeys(NAMES, "sparse")
     capability = th.backends.cpu.get_cpu_capability()
-    sitting = Sitting(0, library.in_use(), capability, th.get_num_threads(), sparse, "fused")
-    assert found == Computing("auto", (sitting,))
+    session = Session(0, library.in_use(), capability, th.get_num_threads(), sparse, "fused")
+    assert found == Computing("auto", (session,))
     assert layers_of(trained) == sparse
 
 
@@ -80,14 +80,14 @@ def test_masks_that_are_asked_for_are_on_record(tmp_path):
 def test_pruning_changes_how_layers_compute_and_the_record_has_both(tmp_path):
     pruned = run("prune", 600, update_interval=5)
     folder = train(pruned, tmp_path).folder
-    (sitting,) = computing_in(RunFolder(folder).record()).sittings
-    assert sitting.layers == dict.fromkeys(NAMES, "dense")
+    (session,) = computing_in(RunFolder(folder).record()).sittings
+    assert session.layers == dict.fromkeys(NAMES, "dense")
     assert layers_of(folder) == dict.fromkeys(NAMES, "sparse")
     told = str(inspect_model(folder))
     assert "Trained from step 0: 0 of 3 layers in sparse storage" in told
 
 
-def test_a_run_that_is_gone_on_with_has_a_sitting_more(tmp_path):
+def test_a_resumed_run_has_one_more_session(tmp_path):
     pruned = run("prune", 1000, update_interval=5)
     stopped = train(pruned, tmp_path, [CtrlC()])
     steps = RunFolder(stopped.folder).record()["num_timesteps"]
@@ -98,7 +98,7 @@ def test_a_run_that_is_gone_on_with_has_a_sitting_more(tmp_path):
     assert second.layers == dict.fromkeys(NAMES, "sparse")  # before its first gradient step
 
 
-def test_sittings_that_came_to_nothing_are_forgotten(trained):
+def test_sessions_that_came_to_nothing_are_forgotten(trained):
     model = train(run(), trained.parent.parent).model
     record = dict(RunFolder(trained).record())
     for steps in (200, 400, 200):
@@ -151,7 +151,7 @@ def test_records_of_older_versions_are_read(trained, record):
 def test_records_that_say_non_zeros_are_read_as_sparse(trained, record):
     now = inspect_model(trained)
     former = json.dumps(record).replace('"sparse"', '"non-zeros"')
-    assert former.count('"non-zeros"') == 2 * len(NAMES)  # in layers, and in the one sitting
+    assert former.count('"non-zeros"') == 2 * len(NAMES)  # in layers, and in the one session
     (trained / "sparsity.json").write_text(former)
     assert inspect_model(trained) == now
 
@@ -164,7 +164,7 @@ def test_records_that_say_non_zeros_are_read_as_sparse(trained, record):
         {"computing": {"asked": "auto", "sittings": [{"num_timesteps": 0}]}},
         {"layers": [{"name": "q_net.q_net.0", "nnz": 80, "compute": "quickly"}]},
         {"layers": 3},
-        {"computing": {"asked": "auto", "sittings": [{**SITTING, "gradient_steps": 3}]}},
+        {"computing": {"asked": "auto", "sittings": [{**SESSION, "gradient_steps": 3}]}},
     ],
 )
 def test_a_damaged_record_is_named(trained, record, damage):

@@ -203,7 +203,7 @@ def test_an_environment_without_settings_says_which_file_which_keys_and_what_to_
     ("content", "message"),
     [
         ("[1, 2]", "must map environment ids"),
-        ("a: [", "no valid YAML"),
+        ("a: [", "not valid YAML"),
         ("CartPole-v1: 3", "must be a mapping of settings"),
         ("CartPole-v1: {policy: MlpPolicy}", "policy must be sb3_sparse.SparsePolicy"),
         ("CartPole-v1: {policy: SparsePolicy, policy_kwargs: 'f()'}", "policy_kwargs must be a"),

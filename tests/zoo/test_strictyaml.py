@@ -14,12 +14,12 @@ from sb3_sparse.zoo.strictyaml import parse
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("a: 1\nb: 2\na: 3", "the key 'a' stands in line 1 and again in line 3"),
-        ("a:\n  b: 1\n  b: 1", "the key 'b' stands in line 2 and again in line 3"),
-        ("a: &x\n  b: 1\n  b: 2\nc: {<<: *x}", "the key 'b' stands in line 2 and again in line 3"),
-        ("a: [{x: 1, x: 2}]", "the key 'x' stands in line 1 and again in line 1"),
+        ("a: 1\nb: 2\na: 3", "the key 'a' is in line 1 and again in line 3"),
+        ("a:\n  b: 1\n  b: 1", "the key 'b' is in line 2 and again in line 3"),
+        ("a: &x\n  b: 1\n  b: 2\nc: {<<: *x}", "the key 'b' is in line 2 and again in line 3"),
+        ("a: [{x: 1, x: 2}]", "the key 'x' is in line 1 and again in line 1"),
         ("a: {<<: {q: 1},\n <<: {r: 1}}", r"the key '<<' .* give a list, <<: \[\*a, \*b\]"),
-        ("1: a\n1.0: b", "the key 1.0 stands in line 1"),
+        ("1: a\n1.0: b", "the key 1.0 is in line 1"),
     ],
 )
 def test_a_key_that_stands_twice_is_refused_with_its_lines(text, said):
@@ -49,7 +49,7 @@ def test_what_is_no_yaml_is_one_line(text):
 def test_every_file_is_read_so(tmp_path):
     path = tmp_path / "mine.yml"
     path.write_text("CartPole-v1: {}\nCartPole-v1: {}\n")
-    said = r"mine\.yml is no valid YAML: the key 'CartPole-v1' stands in line 1 and again in line 2"
+    said = r"mine\.yml is not valid YAML: the key 'CartPole-v1' is in line 1 and again in line 2"
     for read in (
         lambda: read_yaml(path),
         lambda: RunSpec(conf_file=str(path)).settings(),
@@ -62,5 +62,5 @@ def test_every_file_is_read_so(tmp_path):
 def test_a_file_in_another_encoding_is_named(tmp_path):
     path = tmp_path / "mine.yml"
     path.write_bytes("CartPole-v1: {title: Größe}".encode("latin-1"))
-    with pytest.raises(ConfigError, match=r"mine\.yml is no text in UTF-8.*; save it as UTF-8"):
+    with pytest.raises(ConfigError, match=r"mine\.yml is not UTF-8 text.*; save it as UTF-8"):
         read_yaml(path)

@@ -376,7 +376,7 @@ def test_a_full_disk_under_everything_leaves_the_status_of_a_run_that_was_killed
                 monkeypatch.setattr(BufferSaver, "save", full)
             return True
 
-    with pytest.raises(Unwritable, match="goes on from step 400"):
+    with pytest.raises(Unwritable, match="resume it from step 400"):
         train(DQN_RUN, tmp_path, [Fill()])
     monkeypatch.undo()
     folder = tmp_path / "dqn" / "CartPole-v1_1"
@@ -450,7 +450,7 @@ def test_a_run_whose_buffer_is_not_whole_goes_on_with_none_only_when_told(tmp_pa
         resume(stopped.folder)
     assert RunFolder(stopped.folder).record()["status"] == "interrupted"
     shutil.rmtree(buffer)
-    with pytest.warns(UserWarning, match="goes on with an empty one"):
+    with pytest.warns(UserWarning, match="continues with an empty one"):
         done = resume(stopped.folder)
     assert done.finished
     assert done.model.replay_buffer.size() == 500  # of 1000
