@@ -223,14 +223,14 @@ def test_looking_at_a_study_writes_nothing(tmp_path, run_command):
     assert code == 0
     assert "1 waiting" in out
     assert not store.exists()
-    train(cell.run, folder=cell.folder(store))
-    (cell.folder(store) / ".lock").touch()  # of a process that was killed
+    train(cell.run, folder=cell.folder(store).path)
+    (cell.folder(store).path / ".lock").touch()  # of a process that was killed
     before = everything(store)
     code, out, _ = run_command("study", "status", study, "-f", store)
     assert code == 0
     assert "1 done" in out
     assert everything(store) == before
-    record = cell.folder(store) / "sparsity.json"
+    record = cell.folder(store).path / "sparsity.json"
     record.write_bytes(record.read_bytes()[:40])
     code, out, _ = run_command("study", "status", study, "-f", store)
     assert code == 0
