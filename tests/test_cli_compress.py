@@ -89,7 +89,7 @@ def test_environments_are_those_of_the_run(run):
 def test_a_lone_zip_needs_its_environment_and_statistics(run, tmp_path):
     plain = tmp_path / "plain"
     make("PPO", env="CartPole-v1", policy="MlpPolicy").save(plain)
-    with pytest.raises(ConfigError, match=r"does not say what it was trained in; give --env"):
+    with pytest.raises(ConfigError, match=r"does not name its environment; give --env"):
         sb3_sparse("compress", plain)
     with pytest.raises(ConfigError, match="did you mean 'CartPole-v1'"):
         sb3_sparse("compress", plain, "--env", "CartPool-v1")

@@ -110,9 +110,7 @@ def test_a_zip_of_a_normalised_run_alone_needs_its_statistics(
     for arguments in (["export", alone], ["compress", alone, "--env", "Pendulum-v1"]):
         code, said = command(monkeypatch, capsys, *arguments)
         assert code == 2
-        assert (
-            "was trained under a VecNormalize; give its statistics with --vecnormalize FILE" in said
-        )
+        assert "was trained with VecNormalize; give its statistics with --vecnormalize FILE" in said
 
 
 def test_a_zip_alone(monkeypatch, capsys, tmp_path):

@@ -1,4 +1,4 @@
-"""Studies: small YAML files that say what to train, and what runs them to their end."""
+"""Studies: small YAML files of runs to train, and the runner that completes them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The blocks of a study's YAML file, and the runs that they stand for."""
+"""Expands the blocks of a study's YAML file into runs."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from sb3_sparse.zoo.spec import RunSpec
 
 SHIPPED = Path(__file__).parent / "shipped"
 SCALES = ("smoke", "small", "medium", "paper")
-"""Of shipped studies, which have them all but some medium."""
+"""Scales of shipped studies; only some studies have ``medium``."""
 KEYS = {"title", "figures", "varies", "common", "runs", "scales", "measures", "trained"}
 RUN_KEYS = {one.name for one in fields(RunSpec)} - {"seed", "device", "entry"}
 CHOSEN = ("sparsity", "match_params", "method", "distribution", "algo")
-"""What a scale chooses among a block's own values."""
+"""Keys whose values a scale selects from a block's."""
 VARY, SEEDS, MEASURES, SCHEDULE = "vary", "seeds", "measures", "schedule"
 PACKAGES = "gym_packages"
 
 
 def study_names() -> list[str]:
-    """The names of the studies that come with the package."""
+    """Return the names of the studies that come with the package."""
     return sorted(path.stem for path in SHIPPED.glob("*.yml"))
 
 
 def path_of(what: str) -> Path:
-    """The file of a study.
+    """Return the file of a study.
 
     :raises ConfigError: if there is no such study
     """
@@ -40,13 +40,13 @@ def path_of(what: str) -> Path:
         if not path.is_file():
             raise ConfigError(
                 f"unknown study {what!r}{did_you_mean(what, study_names())}; allowed are "
-                f"{', '.join(study_names())}, or a file of your own, .yml (docs/studies.md)"
+                f"{', '.join(study_names())}, or your own .yml file (docs/studies.md)"
             )
     return path
 
 
 def planned_runs(name: str) -> dict[str, int]:
-    """How many runs a shipped study has at each scale, counted without looking at their settings.
+    """Count the runs of a shipped study at each scale, without reading their settings.
 
     :param name: one of :func:`study_names`
     """
@@ -58,21 +58,21 @@ def planned_runs(name: str) -> dict[str, int]:
 
 
 def title_of(name: str) -> str:
-    """The title of a shipped study."""
+    """Return the title of a shipped study."""
     return str(read_yaml(path_of(name), "title, figures, runs and scales")["title"])
 
 
 def planned_arguments(content: Mapping[str, Any], scale: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Arguments of the runs of one seed."""
+    """Return the arguments of each run of one seed."""
     own = {key: value for key, value in scale.items() if key not in (SEEDS, MEASURES, SCHEDULE)}
     common = content.get("common", {})
     return [one for block in content["runs"] for one in _grid(block_of(common, block, own))]
 
 
 def check_keys(given: Any, allowed: set[str], where: str) -> None:
-    """Refuse what is no mapping, and keys that mean nothing.
+    """Reject anything but a mapping with known keys.
 
-    :raises ConfigError: if so
+    :raises ConfigError: naming the unknown keys and those that are allowed
     """
     if not isinstance(given, Mapping):
         raise ConfigError(f"{where} must be a mapping, got {given!r}")
@@ -86,10 +86,10 @@ def check_keys(given: Any, allowed: set[str], where: str) -> None:
 
 
 def block_of(common: Any, block: Any, scale: Mapping[str, Any]) -> dict[str, Any]:
-    """A block of runs as a scale has it.
+    """Apply a scale to a block of runs.
 
-    ``hyperparams`` add up. What a scale says of sparsities, methods or what is varied goes to
-    those blocks alone that speak of it; all else goes to every block.
+    ``hyperparams`` are merged. A scale's sparsities, methods and varied hyperparameters apply only
+    to blocks that set them; its other keys apply to every block.
     """
     for given, where in ((common, "common"), (block, "a block of runs")):
         check_keys(given, RUN_KEYS | {VARY}, where)
@@ -117,13 +117,13 @@ def block_of(common: Any, block: Any, scale: Mapping[str, Any]) -> dict[str, Any
 
 
 def _kept(of_block: Any, of_scale: Any) -> Any:
-    """What a scale leaves of a block's values: those that both have."""
+    """Return the values of a block that the scale has too."""
     wanted = as_list(of_scale)
     return [value for value in as_list(of_block) if value in wanted]
 
 
 def _grid(block: dict[str, Any]) -> Iterator[dict[str, Any]]:
-    """Every combination of the lists in a block, and of what it varies."""
+    """Yield every combination of the lists in a block and of the hyperparameters it varies."""
     varied = block.pop(VARY, {})
     hyperparams = block.pop("hyperparams", {})
     lists = {key: [value] if key == PACKAGES else as_list(value) for key, value in block.items()}
@@ -136,14 +136,14 @@ def _grid(block: dict[str, Any]) -> Iterator[dict[str, Any]]:
 
 
 def as_list(value: Any) -> list[Any]:
-    """The value, as a list if it is none."""
+    """Return a list as it is, and any other value in a list."""
     return value if isinstance(value, list) else [value]
 
 
 def check_lists(varied: Any) -> None:
-    """Refuse a ``vary`` that does not map names to lists.
+    """Reject a ``vary`` that does not map names to lists.
 
-    :raises ConfigError: if so
+    :raises ConfigError: naming the value and an example
     """
     if not isinstance(varied, Mapping) or not all(
         isinstance(values, list) and values for values in varied.values()

@@ -1,4 +1,4 @@
-"""One cell of a study: a run, what is measured of it, and the folder that its content names."""
+"""One cell of a study: a run, its measures, and a folder named by their content."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ DIGITS = 12
 
 @dataclass(frozen=True)
 class Cell:
-    """A run with all that is measured of it. Two studies that want the same share it.
+    """A run with its measures. Studies that contain the same cell share it.
 
-    :param run: what is trained
+    :param run: the run to train
     :param measures: what is measured beside its evaluations
-    :param trained: False: its networks are only built and counted
+    :param trained: False: only build and count its networks
     """
 
     run: RunSpec
@@ -32,11 +32,11 @@ class Cell:
 
     @cached_property
     def address(self) -> str:
-        """12 hexadecimal digits of all that decides what comes out.
+        """A hash, 12 hexadecimal digits, of everything that determines the result.
 
-        That is every setting after configs and overrides, the seed, the evaluations, and what is
-        measured during training; not the device, and not what is measured of the trained model,
-        which may be added later.
+        That is every setting after configs and overrides, the seed, the evaluations, and the
+        measures during training; not the device, nor measures of the trained model, which may be
+        added later.
         """
         run = self.run
         content = {
@@ -55,17 +55,17 @@ class Cell:
         return hashlib.sha256(text.encode()).hexdigest()[:DIGITS]
 
     def folder(self, store: Path) -> RunFolder:
-        """The run's folder, ``<store>/runs/<algo>/<env>_<address>``."""
+        """Return the run's folder, ``<store>/runs/<algo>/<env>_<address>``."""
         name = f"{env_name(self.run.env_id)}_{self.address}"
         return RunFolder(store / RUNS / self.run.algo / name)
 
     def errors(self, store: Path) -> Path:
-        """The file with the tracebacks of a cell that failed; it is there only if it did."""
+        """Return the file of tracebacks, which exists only if the cell failed."""
         return store / "failed" / f"{self.address}.txt"
 
     @property
     def name(self) -> str:
-        """What it is, in a few words."""
+        """A short description of the cell."""
         run = self.run
         if run.match_params is not None:
             how = f"dense as {run.match_params:.0%}"
@@ -82,4 +82,4 @@ class Cell:
 def _plain(value: Any) -> Any:
     if isinstance(value, type):
         return f"{value.__module__}.{value.__qualname__}"
-    raise TypeError(f"{value!r} has no place in a study; give plain values")
+    raise TypeError(f"a study cannot hold {value!r}; give plain values")

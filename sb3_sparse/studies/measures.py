@@ -1,4 +1,4 @@
-"""What a study measures of its runs beside their evaluations."""
+"""The measures that a study takes of its runs, beside their evaluations."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ FILES = {"snr": "snr.csv", "plasticity": "plasticity.csv", "noise": "robustness.
 
 @dataclass(frozen=True)
 class Measures:
-    """Names and arguments.
+    """Measures and their arguments, by name.
 
-    :param during: what callbacks measure while a run is trained
-    :param after: what is measured of the trained model
+    :param during: measures that callbacks take during training
+    :param after: measures of the trained model
     """
 
     during: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
@@ -29,9 +29,9 @@ class Measures:
 
     @classmethod
     def of(cls, given: Any) -> Measures:
-        """From a study's ``measures``: names to arguments.
+        """Parse a study's ``measures``, which map names to arguments.
 
-        :raises ConfigError: for another name or argument
+        :raises ConfigError: for an unknown name or argument, or a value that is not allowed
         """
         if not isinstance(given, Mapping):
             raise ConfigError(
@@ -53,9 +53,9 @@ class Measures:
         )
 
     def check(self, algorithm: type[Any]) -> None:
-        """Refuse an algorithm that cannot be measured so.
+        """Reject an algorithm that does not support these measures.
 
-        :raises ConfigError: and say which can
+        :raises ConfigError: naming the algorithms that do
         """
         if "snr" in self.during:
             from sb3_sparse.analysis.losses import losses_for
@@ -63,7 +63,7 @@ class Measures:
             losses_for(algorithm)
 
     def callbacks(self, folder: Path) -> list[Any]:
-        """New callbacks that write into a run's folder."""
+        """Make callbacks that write into a run's folder."""
         if not self.during:
             return []
         from sb3_sparse.analysis import GradientSNRCallback, PlasticityCallback
@@ -75,16 +75,16 @@ class Measures:
         ]
 
     def missing(self, record: Record) -> dict[str, Mapping[str, Any]]:
-        """What is still to be measured of a trained model.
+        """Return the measures that a trained model still lacks.
 
-        :param record: of its run
+        :param record: the record of its run
         """
         measured = record.measured
         return {name: given for name, given in self.after.items() if measured.get(name) != given}
 
 
 def _check(what: str, value: Any, several: bool) -> None:
-    """Refuse what would fail after training only."""
+    """Reject values that would fail only after training."""
     if several:
         numbers = value if isinstance(value, list) else []
         if not numbers or not all(is_number(one) and one >= 0 for one in numbers):

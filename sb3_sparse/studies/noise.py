@@ -1,4 +1,4 @@
-"""A saved model's environments with noise on what is observed."""
+"""Makes a saved model's environments with noise on their observations."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ SEED = 30_000
 
 
 def noisy_envs(saved: SavedModel, model: BaseAlgorithm) -> Callable[[float], VecEnv]:
-    """What makes ten of a model's environments with noise of a given strength.
+    """Return a function that makes ten of a model's environments with noise of a given strength.
 
     Pixels get ``round(N(0, sigma))`` before stacking; features of vectors ``N(0, sigma * std)``
     before normalisation, with the std that they have while this policy acts without noise.
 
-    :param model: loaded from ``saved``
+    :param model: the model, loaded from ``saved``
     """
 
     def make(wrappers: list[dict[str, Any]]) -> VecEnv:

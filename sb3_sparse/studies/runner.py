@@ -1,4 +1,4 @@
-"""Running a study: every cell that is not done, several at a time."""
+"""Runs a study: every cell that is not done, several at a time."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ FUNCTION = "sb3_sparse.studies.worker:work_on"
 
 @dataclass
 class Progress:
-    """How far a study is. :func:`run_study` yields it.
+    """The progress of a study, which :func:`run_study` yields.
 
     Example::
 
@@ -34,14 +34,14 @@ class Progress:
         steps.close()  # the next call continues
         print(progress.done, "of", progress.planned)
 
-    :param planned: its cells
-    :param done: cells that are done, before this start too
-    :param elsewhere: cells that another process trains
-    :param running: cells that are trained now
-    :param diverged: cells whose training diverged, before this start too
-    :param failed: cells that failed twice, with their tracebacks
+    :param planned: number of cells
+    :param done: cells that are done, including before this start
+    :param elsewhere: cells that another process is training
+    :param running: cells that are being trained here
+    :param diverged: cells whose training diverged, including before this start
+    :param failed: tracebacks of cells that failed twice, by name
     :param retried: names of cells that failed once
-    :param ended: the cell that has just ended, if one has
+    :param ended: name of the cell that has just ended, if one has
     """
 
     planned: int
@@ -57,12 +57,12 @@ class Progress:
 
     @property
     def open(self) -> int:
-        """Cells that are still to be done here."""
+        """Number of cells that are still to be done here."""
         return self.planned - self.done - self.diverged - self.elsewhere - len(self.failed)
 
     @property
     def seconds_left(self) -> float | None:
-        """At the speed so far; None before the first cell has ended."""
+        """Estimated seconds left at the speed so far; None before the first cell has ended."""
         if self.finished_here == 0:
             return None
         return (time.monotonic() - self.started) / self.finished_here * self.open
@@ -71,19 +71,18 @@ class Progress:
 def run_study(
     study: Study, store: Path, launcher: Launcher, workers: int, archive: Path | None = None
 ) -> Generator[Progress, None, None]:
-    """Bring every cell of a study to its end; yields how far it is, about once a second.
+    """Run every cell of a study to its end, and yield the progress about once a second.
 
-    Cells are begun in the study's order, first seeds first. A cell that is done or diverged is not
-    run again, an interrupted one goes on, one that fails is tried a second time after all others.
-    Closing the iterator stops the cells that are running at their next rollout; the next call goes
-    on with them.
+    Cells start in the study's order, first seeds first. Cells that are done or diverged are not
+    run again, interrupted ones resume, and failed ones are tried once more after all others.
+    Closing the iterator stops running cells at their next rollout; the next call resumes them.
 
-    :param study: what to run
-    :param store: folder of the studies' runs, which studies share
+    :param study: the study to run
+    :param store: folder of runs, which studies share
     :param launcher: runs the processes
-    :param workers: how many at a time, 1 or more
-    :param archive: a file of lines (:class:`~sb3_sparse.zoo.archive.Archive`); what it has is done,
-        and each cell that is over becomes a line of it
+    :param workers: number of cells to run at a time, 1 or more
+    :param archive: file of an :class:`~sb3_sparse.zoo.archive.Archive`; cells in it count as done,
+        and each cell that ends is appended to it
     :raises CorruptStateError: if a line of the archive is damaged
     """
     kept = _Kept(store, archive)
@@ -120,7 +119,7 @@ class _Kept:
     """The archive of a study's cells, if there is one.
 
     :param store: folder of the runs
-    :param path: of the archive; None: nothing is kept
+    :param path: the archive's file; None: no archive
     """
 
     def __init__(self, store: Path, path: Path | None) -> None:
@@ -129,7 +128,7 @@ class _Kept:
         self.lines = {} if path is None or not path.exists() else Archive(path).read()
 
     def add(self, cells: Iterable[Cell]) -> None:
-        """Append cells that are over; of what cannot be read a warning says why."""
+        """Append cells that have ended, and warn about those that cannot be read."""
         if self.archive is None:
             return
         found = []

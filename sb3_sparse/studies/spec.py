@@ -1,4 +1,4 @@
-"""A study's YAML file, read and checked."""
+"""Reads and checks a study's YAML file."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from sb3_sparse.zoo.spec import RunSpec
 
 @dataclass(frozen=True)
 class Study:
-    """What is trained, at one scale, and what is drawn of it.
+    """A study at one scale: the cells to train and the figures to draw.
 
     Example::
 
@@ -46,12 +46,12 @@ class Study:
         study = Study.read("classic_control", "smoke")
         print(study.title, len(study.cells), study.cells[0].name)
 
-    :param name: of the file
-    :param scale: one of its file's, e.g. ``"small"``
-    :param title: for its report
-    :param figures: names of figures, as :mod:`sb3_sparse.report` has them
-    :param varies: the setting that the study varies; None: none but method and sparsity
-    :param cells: what is trained, first seeds first
+    :param name: name of the file
+    :param scale: one of the file's scales, e.g. ``"small"``
+    :param title: title of the report
+    :param figures: names of figures of :mod:`sb3_sparse.report`
+    :param varies: the setting that the study varies; None: only method and sparsity
+    :param cells: the cells to train, first seeds first
     :param merged: names of cells that the file has more than once; they are trained once
     """
 
@@ -65,12 +65,12 @@ class Study:
 
     @classmethod
     def read(cls, what: str, scale: str, gym_packages: Sequence[str] = ()) -> Study:
-        """A shipped study, or one's own from a file.
+        """Read a shipped study, or your own from a file.
 
         :param what: a name of :func:`study_names`, or the path of a YAML file (docs/studies.md)
-        :param scale: which of its scales
-        :param gym_packages: modules that register environments, beside those that the file names
-        :raises ConfigError: if there is no such study or scale, or something is wrong with it
+        :param scale: one of its scales
+        :param gym_packages: further modules that register environments
+        :raises ConfigError: if there is no such study or scale, or if it is invalid
         """
         path = path_of(what)
         content = read_yaml(path, "title, figures, runs and scales")
@@ -106,14 +106,14 @@ class Study:
 
     @property
     def report_folder(self) -> Path:
-        """Where its report goes, below the store."""
+        """The folder of its report, relative to the store."""
         return Path(self.name) / self.scale
 
 
 def _cells(
     content: Mapping[str, Any], of_scale: Any, gym_packages: Sequence[str]
 ) -> Iterator[Cell]:
-    """All cells of a scale as the file has them, first seeds first."""
+    """Yield all cells of a scale as the file has them, first seeds first."""
     check_keys(of_scale, RUN_KEYS | {SEEDS, MEASURES, SCHEDULE, VARY}, "a scale")
     if not isinstance(content["runs"], list):
         raise ConfigError(f"runs must be a list of blocks, got {content['runs']!r}")
@@ -169,9 +169,9 @@ def _check_schedule(schedule: Mapping[str, Any]) -> None:
 
 
 def _check_choices(blocks: Sequence[Mapping[str, Any]], scale: Mapping[str, Any]) -> None:
-    """Refuse what a scale chooses and no block has: it would drop runs without a word.
+    """Reject a choice of a scale that no block has: it would silently drop runs.
 
-    :param blocks: as they stand, without the scale
+    :param blocks: the blocks without the scale
     """
     varied = scale.get(VARY, {})
     check_lists(varied)
@@ -192,7 +192,7 @@ def _check_choices(blocks: Sequence[Mapping[str, Any]], scale: Mapping[str, Any]
 
 
 def _with_schedule(arguments: dict[str, Any], schedule: Mapping[str, Any]) -> dict[str, Any]:
-    """With what of a scale's ``schedule`` the method takes: nothing where masks stand still."""
+    """Add the entries of a scale's ``schedule`` that the method takes: none for static masks."""
     run = RunSpec(**arguments)
     callback = run.settings().callback if schedule else None
     if callback is None:

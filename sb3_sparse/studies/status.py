@@ -1,4 +1,4 @@
-"""How far a cell is, by its line in an archive or by its folder."""
+"""The status of a cell, by its line in an archive or by its folder."""
 
 from __future__ import annotations
 
@@ -17,30 +17,30 @@ from sb3_sparse.zoo.record import Record, Status
 
 
 class CellState(str, Enum):
-    """How far a cell is. A finished run is not done until all is measured that is wanted."""
+    """The state of a cell. A finished run is done once all of its measures are taken."""
 
     DONE = "done"
     DIVERGED = "diverged"
-    """Its training diverged, and is not tried again."""
+    """Its training diverged, and is not retried."""
     RUNNING = "running"
-    """Some process trains it now."""
+    """A process is training it now."""
     STOPPED = "stopped"
     """It resumes from its last checkpoint."""
     FAILED = "failed"
     WAITING = "waiting"
-    """Nothing was done yet."""
+    """It has not started."""
 
     __str__ = str.__str__
 
     @property
     def is_over(self) -> bool:
-        """Whether nothing of the cell is left to do."""
+        """Whether the cell has nothing left to do."""
         return self in (CellState.DONE, CellState.DIVERGED)
 
 
 @dataclass(frozen=True)
 class CellStatus:
-    """A cell and how far it is.
+    """A cell with its state and progress.
 
     Example::
 
@@ -51,12 +51,12 @@ class CellStatus:
         status = status_of(study.cells[0], Path("studies"))
         print(status.state, status.steps)
 
-    :param cell: which
-    :param folder: its run's folder, there or not
-    :param state: how far it is
+    :param cell: the cell
+    :param folder: its run's folder, which may not exist
+    :param state: its state
     :param steps: environment steps done
     :param reason: what is wrong with its record; None: nothing, or it failed in training
-    :param archived: its line in the archive, if that has all that is wanted of it
+    :param archived: its line in the archive, if that has all of its measures
     """
 
     cell: Cell
@@ -68,10 +68,10 @@ class CellStatus:
 
 
 def status_of(cell: Cell, store: Path, lines: Lines | None = None) -> CellStatus:
-    """How far a cell is. A line in the archive counts before what lies in its folder.
+    """Return the status of a cell. Its line in the archive takes precedence over its folder.
 
     :param store: folder of the studies' runs
-    :param lines: of the archive
+    :param lines: lines of the archive
     """
     folder = cell.folder(store)
     for line in reversed((lines or {}).get(cell.address, ())):
@@ -86,8 +86,8 @@ def status_of(cell: Cell, store: Path, lines: Lines | None = None) -> CellStatus
     try:
         record = folder.record()
         steps, state = record.num_timesteps, _over(cell, record)
-    except SparsityError as error:  # one damaged record hides no other cell
-        told = str(error).replace(f"{store}{os.sep}", "")  # pages name no path of a machine
+    except SparsityError as error:  # one damaged record must not hide other cells
+        told = str(error).replace(f"{store}{os.sep}", "")  # pages show no path of a machine
         return CellStatus(cell, folder, CellState.FAILED, reason=told)
     if running:
         return CellStatus(cell, folder, CellState.RUNNING, steps)
@@ -95,7 +95,7 @@ def status_of(cell: Cell, store: Path, lines: Lines | None = None) -> CellStatus
 
 
 def _over(cell: Cell, record: Record) -> CellState | None:
-    """Whether a run is done with all that is wanted of it, or diverged; None: neither."""
+    """Return DONE if a run and its measures are complete, DIVERGED if it diverged, else None."""
     if record.status is Status.DIVERGED:
         return CellState.DIVERGED
     wanted = Status.FINISHED if cell.trained else Status.COUNTED
@@ -104,6 +104,6 @@ def _over(cell: Cell, record: Record) -> CellState | None:
 
 
 def counts(statuses: Sequence[CellStatus]) -> dict[CellState, int]:
-    """How many cells there are of each state."""
+    """Count the cells in each state."""
     found = Counter(one.state for one in statuses)
     return {state: found[state] for state in CellState}

@@ -1,6 +1,6 @@
-"""Bringing one cell to its end, in a process of its own.
+"""Runs one cell to its end, in a separate process.
 
-What training needs is imported at the top: once for all cells (:mod:`sb3_sparse.launch.local`).
+The top imports what training needs, once for all cells (:mod:`sb3_sparse.launch.local`).
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from sb3_sparse.zoo.watch import TrainingLog
 
 
 def work_on(cell: Cell, store: Path) -> CellState:
-    """Train a cell, or resume it, and measure what is wanted; its state afterwards.
+    """Train or resume a cell, take its measures, and return its state.
 
-    A run that failed while it was trained resumes from its last checkpoint.
+    A run that failed during training resumes from its last checkpoint.
 
     :param store: folder of the studies' runs
     """
@@ -41,9 +41,9 @@ def work_on(cell: Cell, store: Path) -> CellState:
             return CellState.STOPPED
         with folder.locked():
             _measure(cell, folder)
-    except RunBusy:  # another process has begun it since
+    except RunBusy:  # another process has started it since
         return CellState.RUNNING
-    except Diverged:  # which is on record, and would only hide a bad setting if tried again
+    except Diverged:  # recorded; a retry would only hide a bad setting
         cell.errors(store).unlink(missing_ok=True)
         return CellState.DIVERGED
     cell.errors(store).unlink(missing_ok=True)
@@ -55,7 +55,7 @@ def _is_trained(folder: RunFolder) -> bool:
 
 
 def _train(cell: Cell, folder: RunFolder) -> bool:
-    """Train to the end; whether it was reached."""
+    """Train, and return whether the run reached its end."""
     callbacks = cell.measures.callbacks(folder.path)
     watch = TrainingLog()
     try:
@@ -66,20 +66,20 @@ def _train(cell: Cell, folder: RunFolder) -> bool:
     except RunBusy:
         raise
     except ConfigError:
-        if _is_trained(folder):  # by another process, since this one looked
+        if _is_trained(folder):  # another process finished it meanwhile
             return True
         raise
 
 
 def _measure(cell: Cell, folder: RunFolder) -> None:
-    """Measure what is still wanted of the trained model."""
+    """Take the measures that the trained model still lacks."""
     for name, arguments in cell.measures.missing(folder.record()).items():
         _measure_noise(folder.path, arguments)
         folder.write(measured={**folder.record().measured, name: dict(arguments)})
 
 
 def _measure_noise(folder: Path, arguments: Mapping[str, Any]) -> None:
-    """Return of the last policy under noise, into ``robustness.csv``, whole or not at all."""
+    """Write returns of the last policy under noise to ``robustness.csv``, whole or not at all."""
     from sb3_sparse.analysis import noise_robustness
 
     saved = SavedModel.find(folder)

@@ -15,10 +15,10 @@ END = ".cnn.0"
 
 
 def image_in(space: Any) -> Shape | None:
-    """Shape of the images in an observation space, as SB3 writes it beside the pickle.
+    """Return the shape of the images in an observation space, as SB3 writes it beside the pickle.
 
-    :param space: the plain values that a zip has of it
-    :return: channels first; None if there are none, or several
+    :param space: the space's plain values from a zip
+    :return: channels first; None if there are no images, or several
     """
     if not isinstance(space, Mapping):
         return None
@@ -36,7 +36,7 @@ def _image(shape: list[Any]) -> Shape | None:
 
 
 def _image_in_text(text: str) -> Shape | None:
-    """Of what is printed of a Box: bounds, ``(1, 36, 36)``, dtype."""
+    """Parse the printed form of a Box: bounds, ``(1, 36, 36)``, dtype."""
     if "uint8" not in text or "(" not in text:
         return None
     numbers = text.split("(")[-1].split(")")[0].split(",")
@@ -44,12 +44,12 @@ def _image_in_text(text: str) -> Shape | None:
 
 
 def positions_of(shapes: Mapping[str, Shape], image: Shape | None) -> dict[str, int]:
-    """Output positions of each convolution whose strides are known, by name.
+    """Return the output positions of each convolution whose strides are known, by name.
 
-    What is found is kept only if the layer after the convolutions has as many inputs.
+    They are returned only if they give the number of inputs of the layer that follows.
 
     :param shapes: weight shapes of all layers by dotted name
-    :param image: channels, height and width of what is observed; None: not known
+    :param image: channels, height and width of the observed images; None: unknown
     """
     found: dict[str, int] = {}
     if image is None:

@@ -1,4 +1,4 @@
-"""What is checked of a run before it is trained."""
+"""Checks a run before it is trained."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ PACKAGE = Path(__file__).parents[1]
 
 @dataclass(frozen=True)
 class Prepared:
-    """What is known of a run before it is trained.
+    """A run that has been checked and can be trained.
 
-    :param settings: as it shall be trained; widths of a dense network that matches a sparse one's
-        parameters are in it
+    :param settings: settings to train with, including the widths of a parameter match
     :param evaluation: ``eval_freq`` and ``eval_episodes``
-    :param observation_space: that the policy sees, wrappers and stacking included
-    :param action_space: that it acts in
+    :param observation_space: the policy's observation space, wrappers and stacking included
+    :param action_space: the policy's action space
+    :param match: the parameter match, if the run asks for one
     """
 
     settings: Settings
@@ -45,7 +45,7 @@ class Prepared:
     match: Match | None
 
     def record(self, run: RunSpec) -> dict[str, Any]:
-        """What ``sparsity.json`` says of the run from its start."""
+        """Return the entries that ``sparsity.json`` has from the start of the run."""
         match = {} if self.match is None else {"match": asdict(self.match)}
         return {
             "method": self.settings.method,
@@ -60,8 +60,8 @@ class Prepared:
 def prepare(run: RunSpec, log_folder: Path) -> Prepared:
     """Check a run and make its environment once, without training or writing anything.
 
-    :raises ConfigError: if something is wrong with device, settings or environment, or the
-        algorithm cannot act in it
+    :raises ConfigError: if device, settings or environment are invalid, or the algorithm cannot
+        act in the environment
     """
     check_device(run.device)
     settings, evaluation = run.settings(), run.evaluation()
@@ -80,27 +80,27 @@ def prepare(run: RunSpec, log_folder: Path) -> Prepared:
 
 
 def check_device(device: str) -> None:
-    """Refuse a device that this machine does not have.
+    """Raise if this machine does not have a device.
 
-    :raises ConfigError: if so
+    :raises ConfigError: naming the devices that it has
     """
     if device == "auto":
         return
     here = ["auto", "cpu"] + (["cuda"] if th.cuda.is_available() else [])
     try:
         th.empty(0, device=device)
-    except (RuntimeError, AssertionError) as error:  # its own words, of torch
+    except (RuntimeError, AssertionError) as error:  # torch raises either
         raise ConfigError(
             f"there is no device {device!r} here; give --device {' or '.join(here)}"
         ) from error
 
 
 def count(run: RunSpec, folder: RunFolder) -> None:
-    """Record what a run's networks would hold and cost, in a folder of its own; no training.
+    """Record the size and cost of a run's networks in its folder, without training.
 
-    Networks that would be pruned are counted as they end, not as they begin.
+    Networks that would be pruned are counted at their final sparsity.
 
-    :param folder: as of :func:`sb3_sparse.zoo.training.train`
+    :param folder: the run's folder, as in :func:`sb3_sparse.zoo.training.train`
     :raises ConfigError: as :func:`prepare`
     """
     prepared = prepare(run, folder.path.parent.parent)
@@ -116,17 +116,17 @@ def count(run: RunSpec, folder: RunFolder) -> None:
 
 
 def settings_fail(run: RunSpec) -> str:
-    """What to say when an environment or algorithm fails before training."""
-    return f"the settings of {run.env_id} in {run.config}, with what you changed, do not work"
+    """Return the message for an environment or algorithm that fails before training."""
+    return f"the settings of {run.env_id} in {run.config}, with your changes, do not work"
 
 
 @contextmanager
 def setup_errors(failure: str, env_id: str) -> Iterator[None]:
-    """Turn what environment, zoo and algorithm raise before training into a ConfigError.
+    """Turn errors of environment, zoo and algorithm before training into a ConfigError.
 
-    An error that this package raises itself is a bug of it, and keeps its traceback.
+    An error raised in this package's own code is a bug and keeps its traceback.
 
-    :param failure: what fails then, for the message
+    :param failure: what failed, for the message
     """
     try:
         yield
@@ -146,9 +146,9 @@ def setup_errors(failure: str, env_id: str) -> Iterator[None]:
 
 
 def check_action_space(run: RunSpec, space: spaces.Space[Any]) -> None:
-    """Refuse an environment whose actions the algorithm cannot choose.
+    """Raise if the algorithm cannot choose an environment's actions.
 
-    :raises ConfigError: if so
+    :raises ConfigError: naming the algorithms that can
     """
     able = [
         name.lower()
@@ -158,11 +158,11 @@ def check_action_space(run: RunSpec, space: spaces.Space[Any]) -> None:
     if run.algo not in able:
         raise ConfigError(
             f"{run.algo} cannot act in {run.env_id}, whose actions are {space}; "
-            + (f"take {' or '.join(able)}" if able else "no algorithm can")
+            + (f"use {' or '.join(able)}" if able else "no algorithm can")
         )
 
 
 def _raised_here(error: BaseException) -> bool:
-    """Whether code of this package raised an error, rather than code that it called."""
+    """Whether this package's own code raised an error, rather than code that it called."""
     frames = [frame.f_code.co_filename for frame, _ in traceback.walk_tb(error.__traceback__)]
     return Path(frames[-1]).is_relative_to(PACKAGE)

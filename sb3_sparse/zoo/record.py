@@ -1,4 +1,4 @@
-"""What ``sparsity.json`` says of a run: what it was asked for, what came out, how sparse it is."""
+"""The record of a run, ``sparsity.json``: what was requested, what came out, how sparse it is."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ PACKAGES = (
 
 
 class Status(str, Enum):
-    """How far a run is. A text too: ``Status.RUNNING == "running"``.
+    """The state of a run. Each is a string too: ``Status.RUNNING == "running"``.
 
     Example::
 
@@ -44,16 +44,16 @@ class Status(str, Enum):
     """
 
     RUNNING = "running"
-    """It trains, or was killed while it did."""
+    """It is training, or was killed while training."""
     INTERRUPTED = "interrupted"
     """A signal stopped it; it resumes from its last checkpoint."""
     EVALUATING = "evaluating"
-    """It is trained, and its last and best policies are evaluated."""
+    """It has been trained; its last and best policies are being evaluated."""
     FINISHED = "finished"
     COUNTED = "counted"
     """Its networks were built and counted, and never trained."""
     DIVERGED = "diverged"
-    """Its networks came to hold NaN or infinity. It cannot resume, and no report averages it."""
+    """Its networks came to hold NaN or infinity. It cannot resume; reports do not average it."""
     FAILED = "failed"
     """It raised an error, which the record holds; it resumes from its last checkpoint."""
     PRUNED = "pruned"
@@ -63,14 +63,14 @@ class Status(str, Enum):
 
     @property
     def is_over(self) -> bool:
-        """Whether nothing of the run is left to do."""
+        """Whether the run has nothing left to do."""
         return self in (Status.FINISHED, Status.COUNTED, Status.DIVERGED)
 
 
 class Record(Mapping[str, Any]):
     """The content of a run's ``sparsity.json``, or of its line in an archive.
 
-    A mapping of all that the file holds. The properties check what they return.
+    A mapping of everything in the file. The properties check what they return.
 
     Example::
 
@@ -94,7 +94,7 @@ class Record(Mapping[str, Any]):
         number = content.get("format", FORMAT)
         if not is_whole(number) or number > FORMAT:
             raise CorruptStateError(
-                f"{source} has the format {number!r}, and this sb3-sparse reads up to {FORMAT}; "
+                f"{source} has the format {number!r}, but this sb3-sparse reads up to {FORMAT}; "
                 f"update sb3-sparse, or {cure}"
             )
         try:
@@ -113,7 +113,7 @@ class Record(Mapping[str, Any]):
         return len(self._content)
 
     def reading(self) -> AbstractContextManager[None]:
-        """Turn what a missing or mistyped entry raises within into a CorruptStateError."""
+        """Turn errors over a missing or mistyped entry into a CorruptStateError."""
         return reading(self.source, WHAT, self.cure)
 
     @property
@@ -124,22 +124,22 @@ class Record(Mapping[str, Any]):
 
     @property
     def measured(self) -> Mapping[str, Any]:
-        """Arguments of what was measured of the trained model, by the measure's name."""
+        """Arguments of each measure taken of the trained model, by the measure's name."""
         with self.reading():
             return dict(self.get("measured", {}))
 
     @cached_property
     def spec(self) -> RunSpec:
-        """What is trained.
+        """The run's specification.
 
-        :raises ConfigError: if it cannot be made here, e.g. an environment is not registered
+        :raises ConfigError: if it is not valid here, e.g. its environment is not registered
         """
         with self.reading():
             return RunSpec(**self["run"])
 
     @cached_property
     def settings(self) -> Settings:
-        """The settings it is trained with. Nothing that they name is imported."""
+        """The run's settings. Nothing that they name is imported."""
         with self.reading():
             return Settings(self._mapping("settings"), imports=False)
 
@@ -163,7 +163,7 @@ class Record(Mapping[str, Any]):
 
 
 def as_json(content: Mapping[str, Any]) -> str:
-    """The text of a record's file."""
+    """Return the text of a record's file."""
     return json.dumps(dict(content), indent=1, default=_plain) + "\n"
 
 
@@ -176,7 +176,7 @@ def _plain(value: Any) -> Any:
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python and of every package that decides about a run."""
+    """Return the versions of Python and of every package that affects a run."""
     found = {"python": platform.python_version()}
     for package in PACKAGES:
         try:

@@ -1,4 +1,4 @@
-"""A replay buffer on disk, where each save writes only what is new."""
+"""Saves a replay buffer to disk, writing only new rows each time."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.loading.arrays import read_arrays
 
-ROWS = 10_000  # of one file
+ROWS = 10_000  # per file
 LARGE = ("observations", "next_observations")  # written once and never changed; all else is small
 NOT_SAVED = ("device", "env")
 REST = "rest.pkl"
 
 
 class BufferSaver:
-    """Saves a replay buffer again and again, each time into a new folder.
+    """Saves a replay buffer repeatedly, each time into a new folder.
 
-    Observations lie in files of 10,000 rows. A file of which no row is new is linked from the last
-    folder, so a save takes time and room by what was collected since then.
+    Observations go into files of 10,000 rows. Files without new rows are linked from the last
+    folder, so time and space of a save depend only on the rows added since then.
 
     :param buffer: any replay buffer of SB3
     """
@@ -40,10 +40,10 @@ class BufferSaver:
         self.rows = 0
 
     def save(self, folder: Path, rows: int) -> None:
-        """Save everything.
+        """Save the whole buffer.
 
-        :param folder: new, and kept until the next save
-        :param rows: how many rows have been added since training began
+        :param folder: a new folder; keep it until the next save
+        :param rows: number of rows added since training began
         """
         folder.mkdir(parents=True)
         buffer = self.buffer
@@ -65,9 +65,9 @@ class BufferSaver:
         self.position, self.rows = buffer.pos, rows
 
     def _changed(self, rows: int) -> set[int]:
-        """Numbers of the files that hold a row added since the last save.
+        """Return the numbers of the files that hold a row added since the last save.
 
-        The row at the present position counts: with ``optimize_memory_usage`` it holds the newest
+        The row at the current position counts: with ``optimize_memory_usage`` it holds the newest
         observation.
         """
         size = self.buffer.buffer_size
@@ -76,10 +76,10 @@ class BufferSaver:
 
 
 def restore_buffer(buffer: BaseBuffer, folder: Path) -> None:
-    """Fill a new buffer of the same kind and size with what was saved.
+    """Fill a new buffer of the same kind and size with the saved rows.
 
-    :raises ConfigError: if a part of it is missing, damaged or of another size; what is not there
-        would be rows of zeros, which training takes for experience
+    :raises ConfigError: if a part is missing, damaged or of another size: training would take
+        the missing rows, which are zeros, for experience
     """
     rest = _read(folder, REST, _unpickled)
     for name in ("pos", "full", "buffer_size"):
@@ -103,7 +103,7 @@ def restore_buffer(buffer: BaseBuffer, folder: Path) -> None:
 
 
 def _filled(position: int, full: bool, size: int) -> int:
-    """Rows that are in use; with ``optimize_memory_usage`` the one at the position is too."""
+    """Return the rows in use; ``optimize_memory_usage`` uses the one at the position too."""
     return size if full else min(position + 1, size)
 
 
@@ -127,13 +127,13 @@ def _arrays(path: Path) -> dict[str, Any]:
 
 def _lacking(folder: Path, name: str, what: str) -> ConfigError:
     return ConfigError(
-        f"the replay buffer in {folder} is not whole: {name} {what}. Restore it from a copy, or "
-        "delete that folder to go on with an empty buffer"
+        f"the replay buffer in {folder} is incomplete: {name} {what}. Restore it from a copy, or "
+        "delete that folder to continue with an empty buffer"
     )
 
 
 def end_episodes(buffer: BaseBuffer) -> None:
-    """End the episodes that were under way, since what comes next does not follow on them."""
+    """End unfinished episodes, since the next transitions do not continue them."""
     if isinstance(buffer, HerReplayBuffer):
         buffer.truncate_last_trajectory()
     elif isinstance(buffer, ReplayBuffer) and buffer.size():
@@ -145,7 +145,7 @@ def end_episodes(buffer: BaseBuffer) -> None:
 
 
 def _large_arrays(buffer: BaseBuffer) -> Iterator[tuple[str, NDArray[Any]]]:
-    """Names and arrays of observations, of each part of a dict for itself."""
+    """Yield names and arrays of observations, separately for each part of a dict."""
     for name in LARGE:
         value = getattr(buffer, name, None)
         parts = value if isinstance(value, dict) else {"": value}

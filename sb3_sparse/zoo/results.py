@@ -1,4 +1,4 @@
-"""What comes out of a run."""
+"""The outcome of a run, with the final evaluation of its policies."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ SCORED_SHARE = 0.1
 
 @dataclass(frozen=True)
 class Result:
-    """What came out.
+    """The final evaluation of a policy.
 
     :param what: which policy of the run
     :param mean_return: mean episode return
     :param std_return: its standard deviation over episodes
-    :param episodes: how many
-    :param path: where the model lies
+    :param episodes: number of episodes
+    :param path: the model's zip
     """
 
     what: str
@@ -56,8 +56,8 @@ class Outcome:
             print(outcome.results[0].mean_return, "at sparsity", outcome.sparsity)
 
     :param folder: the run's folder
-    :param model: as it is now
-    :param results: of the last policy and the best one; empty if the run was stopped before its end
+    :param model: the model as the run left it
+    :param results: evaluations of the last and the best policy; empty if the run was stopped
     """
 
     folder: Path
@@ -66,17 +66,17 @@ class Outcome:
 
     @property
     def finished(self) -> bool:
-        """Whether it came to its end."""
+        """Whether the run reached its end."""
         return bool(self.results)
 
     @property
     def sparsity(self) -> float:
-        """Of the model now."""
+        """The model's current sparsity."""
         return self._policy.sparse.sparsity
 
     @property
     def wanted_sparsity(self) -> float:
-        """That its settings ask for."""
+        """The sparsity that the model's settings ask for."""
         layers = list(self._policy.sparse.layers)
         return 1.0 - sum(one.final_nnz for one in layers) / sum(one.size for one in layers)
 
@@ -88,7 +88,7 @@ class Outcome:
 
 
 def score_of(mean_returns: Sequence[float]) -> float:
-    """Score of a run: the mean over the last 10 % of its evaluations, and at least one.
+    """Return a run's score: the mean over the last 10 % of its evaluations, at least one.
 
     :param mean_returns: mean episode return of each evaluation, in order
 
@@ -107,11 +107,11 @@ def final_results(
     episodes: int,
     watch: Watch,
 ) -> tuple[Result, ...]:
-    """Evaluate the last policy and the best one on episodes that neither was chosen by.
+    """Evaluate the last and the best policy on episodes that selected neither.
 
-    :param path: where the last policy lies; the best one lies beside it
-    :param episodes: of each, as many as an evaluation during training has
-    :param watch: is told of each episode
+    :param path: the last policy's zip; the best one is beside it
+    :param episodes: episodes for each policy, as many as in an evaluation during training
+    :param watch: notified of each episode
     """
     if model.get_vec_normalize_env() is not None:
         assert model.env is not None

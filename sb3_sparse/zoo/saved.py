@@ -1,4 +1,4 @@
-"""A model on disk: loading it, and making the environments that it was trained in."""
+"""Loads a saved model, and makes the environments that it was trained in."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ EVALUATION_ENVS = 10
 
 @dataclass(frozen=True)
 class SavedModel:
-    """A saved model, and what is known of where it was trained. :meth:`find` makes one.
+    """A saved model with its training environment. :meth:`find` makes one.
 
     Example::
 
@@ -75,11 +75,11 @@ class SavedModel:
 
     :param path: the zip
     :param algo: algorithm, e.g. ``"sac"``
-    :param env_id: environment that it was trained in; None: not known
-    :param parameters: folder of its run's ``config.yml`` and normalisation; None: it lies in no run
+    :param env_id: environment that it was trained in; None: unknown
+    :param parameters: folder of its run's ``config.yml`` and normalisation; None: it has no run
     :param vecnormalize: statistics that normalised its observations; None: nothing did
     :param settings: how its environments were made, by the names of
-        :data:`~sb3_sparse.zoo.folder.OF_ENVIRONMENT`; empty if it lies in no run
+        :data:`~sb3_sparse.zoo.folder.OF_ENVIRONMENT`; empty if it has no run
     :param gym_packages: modules that register its environment or algorithm
     """
 
@@ -102,17 +102,16 @@ class SavedModel:
         vecnormalize: Path | None = None,
         gym_packages: Sequence[str] = (),
     ) -> SavedModel:
-        """Find a model and all that belongs to it.
+        """Find a model and the files that belong to it.
 
         :param path: a run's folder, of ``sb3-sparse train`` or ``rl_zoo3.train``, or a zip of SB3,
             in such a folder or not
-        :param best: of a folder, the best policy instead of the last
-        :param algo: None: as the run's folder or the file says
-        :param env_id: None: as the run's folder says
+        :param best: take a folder's best policy instead of its last
+        :param algo: algorithm; None: the one that the run's folder or the file names
+        :param env_id: environment; None: the one that the run's folder names
         :param vecnormalize: statistics of a VecNormalize; None: those in the run's folder
-        :param gym_packages: modules that register environments or algorithms, beside those that
-            the run names
-        :raises ConfigError: if there is no model, or what belongs to it is missing
+        :param gym_packages: further modules that register environments or algorithms
+        :raises ConfigError: if the model, or a file that belongs to it, is missing
         :raises CorruptStateError: if one of the files is damaged
         """
         path, folder = locate(path, best)
@@ -144,15 +143,15 @@ class SavedModel:
         return cls(path, algo, env_id, parameters, vecnormalize, settings, packages)
 
     def load(self, env: VecEnv | None = None) -> BaseAlgorithm:
-        """The model; without an environment it is fit for prediction only.
+        """Load the model; without an environment it can only predict.
 
-        Unpickles what SB3 pickled: the file must come from somebody you trust.
+        This unpickles what SB3 pickled, so load only files from people you trust.
 
-        :param env: to train on in
-        :raises ConfigError: if there is no such file, or it does not suit ``env``
+        :param env: environment to continue training in
+        :raises ConfigError: if there is no such file, or the model does not suit ``env``
         :raises CorruptStateError: if the file is damaged or of another algorithm, or if masks and
             weights in it disagree
-        :raises Diverged: if its network is not finite
+        :raises Diverged: if a network is not finite
         """
         check_state(look_into(self.path).state, str(self.path))
         if env is not None:
@@ -170,7 +169,7 @@ class SavedModel:
             return model
 
     def policy(self) -> BasePolicy:
-        """The policy alone, for prediction.
+        """Load the policy alone, for prediction.
 
         :raises ConfigError: as :meth:`load`
         :raises CorruptStateError: as :meth:`load`
@@ -192,19 +191,18 @@ class SavedModel:
         except (ValueError, AssertionError) as error:
             raise ConfigError(
                 f"{self.path} does not suit {self.env_id}: {error}; give the environment that it "
-                "was trained in, and a run's folder where it wraps or stacks observations"
+                "was trained in, and the run's folder if that run wraps or stacks observations"
             ) from error
 
     @property
     def environment(self) -> str:
-        """The environment's id, which is registered now.
+        """The environment's id; reading it registers the environment.
 
-        :raises ConfigError: if the environment is not known, or not registered
+        :raises ConfigError: if the environment is unknown, or not registered
         """
         if self.env_id is None:
             raise ConfigError(
-                f"{self.path} does not say what it was trained in; give --env, e.g. --env "
-                "CartPole-v1"
+                f"{self.path} does not name its environment; give --env, e.g. --env CartPole-v1"
             )
         import_packages(self.gym_packages)
         known_environment(self.env_id)
@@ -212,7 +210,7 @@ class SavedModel:
 
     @property
     def acts_deterministically(self) -> bool:
-        """Whether rl-zoo evaluates such a model deterministically: all but Atari games."""
+        """Whether rl-zoo evaluates the model deterministically: yes, except in Atari games."""
         return not is_atari(self.environment)
 
     def envs(
@@ -224,14 +222,14 @@ class SavedModel:
         wrappers: Sequence[Mapping[str, Any]] = (),
         env_kwargs: Mapping[str, Any] | None = None,
     ) -> VecEnv:
-        """Environments with the wrappers, stacking and normalisation of the model's training.
+        """Make environments with the wrappers, stacking and normalisation of the training.
 
-        :param n_envs: how many side by side, in this process
+        :param n_envs: number of environments, all in this process
         :param training: whether rewards are normalised and statistics updated
-        :param wrappers: further ones, around those of the run but below stacking and
-            normalisation; each a path to its arguments, as in rl-zoo's ``env_wrapper``
-        :param env_kwargs: arguments of the environment beside those of the run
-        :raises ConfigError: if the environment is not known or registered, or cannot be made
+        :param wrappers: further wrappers, around those of the run but below stacking and
+            normalisation; each maps a path to its arguments, as in rl-zoo's ``env_wrapper``
+        :param env_kwargs: further arguments of the environment
+        :raises ConfigError: if the environment is unknown, not registered, or cannot be made
         :raises CorruptStateError: if a file that belongs to the model is damaged
         """
         env_id = self.environment
@@ -271,9 +269,9 @@ class SavedModel:
         return envs
 
     def training_envs(self, n_envs: int | None, seed: int) -> VecEnv:
-        """Environments to train on in.
+        """Make environments to continue training in.
 
-        :param n_envs: None: as many as it was trained in
+        :param n_envs: number of environments; None: as many as the model was trained in
         :raises ConfigError: as :meth:`envs`
         :raises CorruptStateError: as :meth:`envs`
         """
@@ -286,20 +284,20 @@ class SavedModel:
         return self.envs(n_envs, seed, training=True)
 
     def evaluation_envs(self, episodes: int, seed: int) -> VecEnv:
-        """Environments with true rewards, and statistics that stay as they are.
+        """Make environments with unnormalised rewards, whose statistics do not change.
 
-        :param episodes: of one evaluation
+        :param episodes: episodes of one evaluation
         :raises ConfigError: as :meth:`envs`
         :raises CorruptStateError: as :meth:`envs`
         """
-        # Atari's episodes end with each life, in the middle of a game that several would not leave.
+        # An Atari episode is one life: of several environments, none might finish a game.
         atari = is_atari(self.environment)
         return self.envs(1 if atari else max(1, min(EVALUATION_ENVS, episodes)), seed)
 
     def write_run_files(self, folder: Path) -> None:
-        """Write the files by which rl-zoo and ``sb3-sparse enjoy`` know a run.
+        """Write the files that make a folder a run for rl-zoo and ``sb3-sparse enjoy``.
 
-        :param folder: the run's own; its model will be ``<env>.zip``
+        :param folder: the run's folder; its model will be ``<env>.zip``
         """
         env_id = self.environment
         parameters = RunFolder(folder).parameters(env_id)
@@ -320,13 +318,13 @@ class SavedModel:
 
 
 def locate(path: Path, best: bool = False) -> tuple[Path, RunFolder]:
-    """The zip of a model, and the folder that it lies in, which may be a run's.
+    """Return a model's zip and its folder, which may be a run's.
 
-    :param path: a run's folder, or a zip, whose suffix may be left out
-    :param best: of a folder, the best policy instead of the last
+    :param path: a run's folder, or a zip, with or without its suffix
+    :param best: take a folder's best policy instead of its last
     :raises ConfigError: if a folder holds no run or no such model
     """
-    if not RunFolder(path).is_run:  # a run may have a folder of its zip's name
+    if not RunFolder(path).is_run:  # a run may have a folder that is named like its zip
         path = zip_path(path)
     if not path.is_dir():
         return path, RunFolder(path.parent)
@@ -335,9 +333,9 @@ def locate(path: Path, best: bool = False) -> tuple[Path, RunFolder]:
 
 
 def check_wrappers(settings: Mapping[str, Any]) -> None:
-    """Reject what is no wrapper: calling whatever a file names would run anything.
+    """Reject anything but wrappers: calling whatever a file names could run any code.
 
-    :raises ConfigError: if so
+    :raises ConfigError: naming the first that is not a wrapper
     """
     for name, kind in (("env_wrapper", gym.Wrapper), ("vec_env_wrapper", VecEnvWrapper)):
         given = settings.get(name) or []
@@ -346,32 +344,32 @@ def check_wrappers(settings: Mapping[str, Any]) -> None:
             found = import_path(path)
             if not (isinstance(found, type) and issubclass(found, kind)):
                 raise ConfigError(
-                    f"{name} {path} is no subclass of {kind.__module__}.{kind.__name__}; make it "
-                    "one"
+                    f"{name} {path} is not a subclass of {kind.__module__}.{kind.__name__}; "
+                    "make it one"
                 )
 
 
 def check_attributes(path: Path, algo: str, data: Mapping[str, Any]) -> None:
-    """Reject a model with a setting that it cannot train on with.
+    """Reject a model with a setting that it cannot be trained with.
 
-    :param path: of its zip
+    :param path: the model's zip
     :param algo: algorithm, e.g. ``"sac"``
-    :param data: the model's attributes; those that are no plain values are not looked at
-    :raises CorruptStateError: if so
+    :param data: the model's attributes; only plain values are checked
+    :raises CorruptStateError: naming the setting and what it may be
     """
     for name, value in data.items():
         kind = WHOLE if name in COUNTED else kind_of(algo, name)
         plain = value is None or isinstance(value, (bool, int, float, str, list, dict))
         if kind is not None and plain and not kind.fits(value):
             raise CorruptStateError(
-                f"{path} cannot be trained on with: {name} must be {kind.allowed}, got {value!r}. "
-                "Load it, set that, and save it again; or take an earlier one"
+                f"{path} cannot be trained further: {name} must be {kind.allowed}, got {value!r}. "
+                "Load it, correct that and save it again, or use an earlier model"
             )
     episodes = {type(data.get(name)) for name in ("ep_info_buffer", "ep_success_buffer")}
     if episodes not in ({deque}, {type(None)}):
         raise CorruptStateError(
-            f"{path} is damaged: a buffer of episodes is missing or of another type; take an "
-            "earlier one"
+            f"{path} is damaged: a buffer of episodes is missing or of another type; use an "
+            "earlier model"
         )
 
 
@@ -379,10 +377,10 @@ def check_start(start: Path, run: RunSpec) -> None:
     """Reject a model or statistics that training cannot resume from.
 
     :param start: folder of a checkpoint, or of the run
-    :param run: what is trained
+    :param run: the run to resume
     :raises ConfigError: if there is no model
-    :raises CorruptStateError: if one of the two files is damaged
-    :raises Diverged: if one of them is not finite
+    :raises CorruptStateError: if model or statistics are damaged
+    :raises Diverged: if model or statistics are not finite
     """
     parameters = RunFolder(start).parameters(run.env_id)
     saved = SavedModel(parameters.with_name(f"{parameters.name}.zip"), run.algo)
@@ -393,9 +391,9 @@ def check_start(start: Path, run: RunSpec) -> None:
 
 
 def _statistics_of_run(parameters: Path, settings: Mapping[str, Any]) -> Path | None:
-    """The statistics in a run's folder; None if it was not normalised.
+    """Return the statistics file in a run's folder; None if the run was not normalised.
 
-    :raises ConfigError: if they are not there though it was, or there though it was not
+    :raises ConfigError: if the file is missing though the run was normalised, or the reverse
     """
     path = parameters / VECNORMALIZE
     if settings["normalize"] and not path.is_file():
@@ -405,36 +403,36 @@ def _statistics_of_run(parameters: Path, settings: Mapping[str, Any]) -> Path | 
         )
     if path.is_file() and not settings["normalize"]:
         raise ConfigError(
-            f"{path} is there, though {parameters / CONFIG} says that nothing was normalised; give "
+            f"{path} exists, though by {parameters / CONFIG} nothing was normalised; give "
             f"--vecnormalize {path} to use it, or remove it"
         )
     return path if settings["normalize"] else None
 
 
 def _check_lone(path: Path, algo: str) -> None:
-    """Refuse a zip outside a run that was, or may have been, normalised.
+    """Reject a zip outside a run whose observations were, or may have been, normalised.
 
-    :raises ConfigError: if so
+    :raises ConfigError: explaining which statistics to give
     """
     for beside in (path.with_name(VECNORMALIZE), path.with_suffix("") / VECNORMALIZE):
         if beside.is_file():
             raise ConfigError(
-                f"{beside} lies beside {path}: give --vecnormalize {beside} if the observations of "
-                "this model were normalised by it, else move it elsewhere"
+                f"{beside} is beside {path}: give --vecnormalize {beside} if it normalised the "
+                "observations of this model, else move it elsewhere"
             )
     if issubclass(algorithms()[algo], OnPolicyAlgorithm):
         data, _ = read_model(path)
         if differ(*map(data.get, LAST_SEEN[:2])):
             raise ConfigError(
-                f"{path} was trained under a VecNormalize; give its statistics with --vecnormalize "
-                "FILE, also if it normalised rewards alone"
+                f"{path} was trained with VecNormalize; give its statistics with --vecnormalize "
+                "FILE, even if it normalised only rewards"
             )
 
 
 def _algo(path: Path, given: str | None, known: str | None) -> str:
-    """The algorithm to load a zip by.
+    """Return the algorithm to load a zip with.
 
-    :raises ConfigError: if the one given is none, or not the file's
+    :raises ConfigError: if the given one is unknown, or not the file's
     """
     if given is None:
         return known or algos_of(path)[0]
@@ -447,12 +445,12 @@ def _algo(path: Path, given: str | None, known: str | None) -> str:
 
 
 def algos_of(path: Path) -> list[str]:
-    """The algorithms that may have saved a zip, told by its policy and attributes.
+    """Return the algorithms that may have saved a zip, by its policy and attributes.
 
     There are several where they share a policy class, as TD3 and DDPG do; the first is the
     likeliest.
 
-    :raises ConfigError: if it is no model, or of an algorithm that is not supported
+    :raises ConfigError: if the zip is not a model, or of an unsupported algorithm
     """
     data, _ = read_model(path)
     policy = data.get("policy_class")

@@ -1,4 +1,4 @@
-"""Watching and scoring a saved model."""
+"""Evaluates a saved model, and records videos of it."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ VIDEO_STEPS = 1000
 
 @dataclass(frozen=True)
 class Score:
-    """What an evaluation found.
+    """The result of an evaluation.
 
-    :param model: file of the policy
+    :param model: the policy's zip
     :param mean_return: mean episode return
     :param std_return: its standard deviation over episodes
-    :param episodes: how many
-    :param videos: the videos of this run
+    :param episodes: number of episodes
+    :param videos: videos of the policy
     """
 
     model: Path
@@ -55,22 +55,21 @@ def enjoy(
     vecnormalize: Path | None = None,
     on_episode: Callable[[int], None] = lambda done: None,
 ) -> Score:
-    """Evaluate a saved policy, deterministically (but for Atari games), as rl-zoo does.
+    """Evaluate a saved policy as rl-zoo does: deterministically, except in Atari games.
 
     :param path: a run's folder, of ``sb3-sparse train`` or of ``rl_zoo3.train``, or a zip of SB3
-    :param episodes: how many, 1 or more
-    :param best: of a folder, the best policy instead of the last
+    :param episodes: number of episodes, 1 or more
+    :param best: take a folder's best policy instead of its last
     :param video: record the first 1000 steps in a folder ``videos`` beside the zip
-    :param seed: of the environment
-    :param gym_packages: modules that register environments or algorithms, beside those that the run
-        names
-    :param algo: None: as the run's folder or the file says
-    :param env_id: None: as the run's folder says
+    :param seed: seed of the environment
+    :param gym_packages: further modules that register environments or algorithms
+    :param algo: algorithm; None: the one that the run's folder or the file names
+    :param env_id: environment; None: the one that the run's folder names
     :param vecnormalize: statistics of a VecNormalize; None: those in the run's folder
-    :param on_episode: is told how many episodes are over, at the start and after each
-    :raises ConfigError: if there is no model, or what belongs to it is missing
+    :param on_episode: called with the number of finished episodes, at the start and after each
+    :raises ConfigError: if the model, or a file that belongs to it, is missing
     :raises CorruptStateError: if a file is damaged
-    :raises Diverged: if the network is not finite
+    :raises Diverged: if a network is not finite
     """
     if episodes < 1:
         raise ConfigError(f"episodes must be 1 or more, got {episodes}")
@@ -124,9 +123,9 @@ def enjoy(
 
 @contextmanager
 def _filmed(saved: SavedModel, video: bool) -> Iterator[None]:
-    """Turn errors while a video is made into errors about the video.
+    """Report errors while filming as errors about the video.
 
-    MoviePy's own progress bar, which always goes to stderr, is dropped.
+    MoviePy's progress bar, which always goes to stderr, is dropped.
     """
     try:
         with redirect_stderr(io.StringIO()) if video else nullcontext():

@@ -1,4 +1,4 @@
-"""The settings of a run: a config's entry with what the user changes in it."""
+"""The settings of a run: a config's entry with the user's overrides."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from sb3_sparse.errors import ConfigError, did_you_mean
 from sb3_sparse.policies.arguments import arguments_of, import_path
 from sb3_sparse.topology import method_named
 
-if TYPE_CHECKING:  # which is imported when settings are checked, not when names are read
+if TYPE_CHECKING:  # imported when settings are checked, not when names are read
     from stable_baselines3.common.base_class import BaseAlgorithm
 
 POLICY = "sb3_sparse.SparsePolicy"
@@ -39,15 +39,15 @@ ZOO_KEYS = frozenset(
         "vec_env_wrapper",
     }
 )
-"""What rl-zoo reads itself, beside the arguments of the algorithm's constructor."""
+"""Keys that rl-zoo itself reads, beside the arguments of the algorithm's constructor."""
 SET_BY_THE_RUN = frozenset({"device", "seed", "tensorboard_log", "verbose"})
-"""Arguments of every algorithm that options of their own set."""
+"""Constructor arguments of every algorithm that separate options set."""
 COMPARED = frozenset({"sparsity", "initial_sparsity", "method", "callback", "policy_kwargs"})
-"""What :meth:`Settings.variant` leaves out, or lists apart."""
+"""Names that :meth:`Settings.variant` omits or lists separately."""
 
 
 class Settings(Mapping[str, Any]):
-    """The settings of a run, as a config's entry has them. They cannot be changed.
+    """The settings of a run, in the form of a config's entry. They are immutable.
 
     A mapping of rl-zoo's names: the algorithm's arguments, ``policy_kwargs``, ``callback``,
     ``n_timesteps`` and so on. ``policy_kwargs`` is always a mapping.
@@ -60,8 +60,8 @@ class Settings(Mapping[str, Any]):
         print(settings.method, settings.policy_kwargs["sparsity"], settings["n_timesteps"])
 
     :param content: the mapping; it is copied
-    :param imports: whether dotted paths may be imported to tell what they are. False for settings
-        from a stranger's file: then a callback with a ``method`` counts as a SparsityCallback
+    :param imports: whether dotted paths may be imported to identify them. False for settings
+        that you do not trust: then a callback with a ``method`` counts as a SparsityCallback
     :raises ConfigError: if ``policy_kwargs`` or the callback has another form
     """
 
@@ -83,17 +83,17 @@ class Settings(Mapping[str, Any]):
         return f"Settings({self._content!r})"
 
     def as_dict(self) -> dict[str, Any]:
-        """A copy that may be changed."""
+        """Return a copy that you may change."""
         return deepcopy(self._content)
 
     @property
     def policy_kwargs(self) -> dict[str, Any]:
-        """The policy's arguments; a copy."""
+        """A copy of the policy's arguments."""
         return deepcopy(self._content["policy_kwargs"])
 
     @property
     def callback(self) -> Mapping[str, Any] | None:
-        """The arguments of the SparsityCallback; None if there is none.
+        """The arguments of the SparsityCallback; None if the settings have none.
 
         :raises ConfigError: if a callback has another form, or lacks its method
         """
@@ -102,7 +102,7 @@ class Settings(Mapping[str, Any]):
 
     @property
     def has_own_callback(self) -> bool:
-        """Whether a subclass of SparsityCallback, which may take other arguments, is used."""
+        """Whether the callback is a user's subclass, which may take other arguments."""
         found = _sparsity_callback(self._content, self._imports)
         return found is not None and found[0]
 
@@ -110,7 +110,7 @@ class Settings(Mapping[str, Any]):
     def method(self) -> str:
         """The topology method; ``"static"`` without a callback, ``"dense"`` at sparsity 0.
 
-        :raises ConfigError: if the policy is not a sparse one
+        :raises ConfigError: if the policy is not sparse
         """
         policy = self.get("policy")
         if policy not in (POLICY, ALIAS):
@@ -125,14 +125,14 @@ class Settings(Mapping[str, Any]):
         return DENSE if all(share == 0.0 for share in shares) else "static"
 
     def changed(self, overrides: Mapping[str, Any], algorithm: type[BaseAlgorithm]) -> Settings:
-        """These settings with each override where it belongs: callback, policy or algorithm.
+        """Return these settings with each override in its place: callback, policy or algorithm.
 
         The names do not overlap, so ``update_interval``, ``weight_decay`` and ``learning_rate``
-        each find their own place. A mapping given for a mapping is merged into it.
+        each find their own place. A mapping that overrides a mapping is merged into it.
 
         :param overrides: values by name
-        :param algorithm: whose settings these are
-        :raises ConfigError: for a name that none of them has
+        :param algorithm: the algorithm that the settings are for
+        :raises ConfigError: for a name that none of the three has
         """
         names, content = Names.of(algorithm), self.as_dict()
         for name, value in overrides.items():
@@ -159,14 +159,14 @@ class Settings(Mapping[str, Any]):
         return Settings(content, imports=self._imports)
 
     def replaced(self, **content: Any) -> Settings:
-        """These settings with other values of rl-zoo's names."""
+        """Return these settings with other values for some of rl-zoo's names."""
         return Settings({**self._content, **content}, imports=self._imports)
 
     def value(self, name: str, algorithm: type[BaseAlgorithm] | None = None) -> Any:
-        """A setting, wherever it lies: of the policy, the callback or the algorithm.
+        """Return a setting of the policy, the callback or the algorithm.
 
-        :param algorithm: whose default counts where the settings lack the name
-        :return: ``"default"`` where the default depends on the method
+        :param algorithm: gives the default where the settings lack the name
+        :return: the value; ``"default"`` where the default depends on the method
         """
         for place in (self["policy_kwargs"], self.callback or {}, self):
             if name in place:
@@ -185,9 +185,9 @@ class Settings(Mapping[str, Any]):
         return "default"
 
     def variant(self, without: Iterable[str] = ()) -> str:
-        """All settings but method and sparsity, as one comparable text.
+        """Return all settings but method and sparsity as one comparable string.
 
-        :param without: further names to leave out
+        :param without: further names to omit
         """
         hidden = {*COMPARED, *without}
         parts = {"policy_kwargs": self["policy_kwargs"], "callback": self.callback or {}}
@@ -200,11 +200,11 @@ class Settings(Mapping[str, Any]):
 
 @dataclass(frozen=True)
 class Names:
-    """The arguments that settings may hold, by whose they are. They do not overlap.
+    """The names of the arguments that settings may hold, by owner. They do not overlap.
 
-    :param algorithm: of the algorithm's constructor and of rl-zoo
-    :param policy: of the sparse policy
-    :param schedule: of the SparsityCallback, but for its method
+    :param algorithm: arguments of the algorithm's constructor and of rl-zoo
+    :param policy: arguments of the sparse policy
+    :param schedule: arguments of the SparsityCallback, except its method
     """
 
     algorithm: frozenset[str]
@@ -213,7 +213,7 @@ class Names:
 
     @classmethod
     def of(cls, algorithm: type[BaseAlgorithm]) -> Names:
-        """Those that go with an algorithm."""
+        """Return the names that the settings of an algorithm may hold."""
         from sb3_sparse.callback import SparsityCallback
 
         return cls(
@@ -224,7 +224,7 @@ class Names:
 
     @property
     def all(self) -> frozenset[str]:
-        """All of them."""
+        """The names of all three owners."""
         return self.algorithm | self.policy | self.schedule
 
 
@@ -235,7 +235,7 @@ def _listed(names: Iterable[str]) -> str:
 def _sparsity_callback(
     settings: Mapping[str, Any], imports: bool
 ) -> tuple[bool, dict[str, Any]] | None:
-    """Whether the SparsityCallback is a subclass of the user's, and its arguments."""
+    """Return whether the SparsityCallback is a user's subclass, and its arguments."""
     callbacks = settings.get("callback") or []
     for callback in callbacks if isinstance(callbacks, list) else [callbacks]:
         named = callback if isinstance(callback, dict) else {callback: {}}
@@ -254,7 +254,7 @@ def _sparsity_callback(
 
 
 def _is_own(path: object) -> bool | None:
-    """Whether a path names a subclass of SparsityCallback; None: neither that nor itself."""
+    """Return True for a subclass of SparsityCallback, False for itself, None for other paths."""
     if not isinstance(path, str):
         raise ConfigError(f"a callback is a dotted path, e.g. {CALLBACK}, got {path!r}")
     if path == CALLBACK:
@@ -264,7 +264,7 @@ def _is_own(path: object) -> bool | None:
     try:
         found = import_path(path)
     except ImportError:
-        return None  # rl-zoo says so when it imports it
+        return None  # rl-zoo reports this when it imports the callback
     ours = isinstance(found, type) and issubclass(found, SparsityCallback)
     return found is not SparsityCallback if ours else None
 
@@ -282,10 +282,10 @@ def _policy_kwargs(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def parse_overrides(texts: Iterable[str]) -> dict[str, Any]:
-    """``["learning_rate:0.001", ...]`` as rl-zoo's ``--hyperparams`` takes them.
+    """Parse ``["learning_rate:0.001", ...]``, the form of rl-zoo's ``--hyperparams``.
 
-    A value is a Python literal or ``dict(...)`` of literals; all else (``lin_0.001``, a dotted
-    path) is text.
+    A value is a Python literal or ``dict(...)`` of literals; anything else (``lin_0.001``, a
+    dotted path) is text.
 
     :raises ConfigError: for a text without a colon
     """

@@ -1,4 +1,4 @@
-"""What to train: names and numbers, checked when made."""
+"""The specification of a run: names and numbers, checked when it is made."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from sb3_sparse.zoo.environments import (
 )
 from sb3_sparse.zoo.settings import DENSE, Settings
 
-if TYPE_CHECKING:  # which is imported when settings are checked, not when a run is named
+if TYPE_CHECKING:  # imported when settings are checked, not when a run is named
     from stable_baselines3.common.base_class import BaseAlgorithm
 
 _TEXT = Kind("a text", lambda v: isinstance(v, str))
@@ -42,7 +42,7 @@ OPTIONAL = frozenset({"method", "conf_file", "entry", *COUNTS})
 
 @dataclass(frozen=True)
 class RunSpec:
-    """What to train. None leaves a value to the config.
+    """The specification of a run. None leaves a value to the config.
 
     Example::
 
@@ -52,13 +52,13 @@ class RunSpec:
         print(run.settings()["policy_kwargs"])
 
     :param algo: algorithm, e.g. ``"sac"``
-    :param env_id: Gymnasium id; ``"package:Id-v0"`` becomes ``"Id-v0"`` and one more package
-    :param method: ``"dense"`` or a topology method; None: as ``conf_file`` says, else RigL
+    :param env_id: Gymnasium id; ``"package:Id-v0"`` is ``"Id-v0"`` with one more package
+    :param method: ``"dense"`` or a topology method; None: that of ``conf_file``, else RigL
     :param sparsity: removed fraction, in [0, 1)
     :param distribution: ``"erk"``, ``"er"`` or ``"uniform"``
-    :param seed: seed of everything
+    :param seed: seed of all random numbers
     :param n_timesteps: environment steps
-    :param n_envs: environments side by side
+    :param n_envs: number of parallel environments
     :param device: as in SB3
     :param hyperparams: further values that replace the config's, by name: arguments of the
         algorithm, the policy, the SparsityCallback or rl-zoo
@@ -68,8 +68,8 @@ class RunSpec:
     :param eval_freq: environment steps between two evaluations
     :param eval_episodes: episodes of one evaluation
     :param entry: settings to use instead of the config's entry for the environment
-    :param gym_packages: modules to import, which register environments or algorithms; rl-zoo's
-        ``--gym-packages``
+    :param gym_packages: modules to import that register environments or algorithms, as with
+        rl-zoo's ``--gym-packages``
     :raises ConfigError: for a name or value that is not allowed
     """
 
@@ -91,7 +91,7 @@ class RunSpec:
     gym_packages: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        for one in fields(self):  # NumPy's numbers, which no JSON takes, become Python's
+        for one in fields(self):  # JSON takes Python's numbers, but not NumPy's
             object.__setattr__(self, one.name, plain(getattr(self, one.name)))
         self._check_types()
         env_id, packages = plain_id(self.env_id, package_names(self.gym_packages))
@@ -103,7 +103,7 @@ class RunSpec:
             raise ConfigError(
                 f"unknown algorithm {self.algo!r}{did_you_mean(self.algo, known)}; allowed are "
                 f"{', '.join(known)} (tqc, qrdqn, crossq and trpo need sb3-sparse[contrib]; "
-                "--gym-packages names a module that registers algorithms of your own)"
+                "--gym-packages names a module that registers your own algorithms)"
             )
         known_environment(env_id)
         if self.sparsity is not None:
@@ -127,7 +127,7 @@ class RunSpec:
                 raise ConfigError(f"{name} must be {kind.allowed}, got {value!r}")
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Unpickle, where the environment may not be registered yet: in a worker."""
+        """Unpickle in a worker, where the environment may not be registered yet."""
         vars(self).update(state)
         import_packages(self.gym_packages)
 
@@ -144,18 +144,18 @@ class RunSpec:
         return config_path(self.method or "rigl", self.conf_file or self.algo)
 
     def config_entry(self) -> dict[str, Any]:
-        """The config's entry for the environment; a copy.
+        """Return a copy of the config's entry for the environment.
 
-        :raises ConfigError: if it has nothing
+        :raises ConfigError: if the config has none
         """
         if self.entry is not None:
             return deepcopy(dict(self.entry))
         return entry_of(self.config, self.env_id, is_atari(self.env_id))
 
     def settings(self) -> Settings:
-        """The config's entry, with everything that this run changes in it.
+        """Return the config's entry with everything that this run changes in it.
 
-        :raises ConfigError: if the config has none, or if it and the run contradict each other
+        :raises ConfigError: if the config has no entry, or its entry contradicts the run
         """
         settings = Settings(self.config_entry())
         method = settings.method
@@ -185,7 +185,7 @@ class RunSpec:
         check_settings(settings, self.algorithm)
         if settings.method != method:
             raise ConfigError(
-                f"what is changed makes this {settings.method!r} training, not {method!r}; "
+                f"your changes make this {settings.method!r} training, not {method!r}; "
                 f"choose it with --method {settings.method}"
             )
         if "n_timesteps" not in settings:
@@ -196,20 +196,20 @@ class RunSpec:
         return settings.replaced(n_timesteps=int(settings["n_timesteps"]))
 
     def evaluation(self) -> dict[str, int]:
-        """``eval_freq`` and ``eval_episodes``."""
+        """Return ``eval_freq`` and ``eval_episodes``."""
         schedule = evaluation_of(self.algo, self.env_id, is_atari(self.env_id))
         given = {name: getattr(self, name) for name in schedule}
         return {name: given[name] or value for name, value in schedule.items()}
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values from which ``RunSpec(**values)`` makes an equal one."""
+        """Return plain values from which ``RunSpec(**values)`` makes an equal run."""
         values = {**asdict(self), "hyperparams": dict(self.hyperparams)}
-        packages = values.pop("gym_packages")  # named only where there are any, as in old files
+        packages = values.pop("gym_packages")  # omitted if empty, as in old files
         return {**values, "gym_packages": list(packages)} if packages else values
 
 
 def plain(value: Any) -> Any:
-    """A value with Python's numbers and lists in place of NumPy's, in mappings and lists too."""
+    """Replace NumPy's numbers and arrays by Python's, inside mappings and lists too."""
     if isinstance(value, (np.generic, np.ndarray)):
         return plain(value.tolist())
     if isinstance(value, Mapping):
@@ -225,5 +225,5 @@ def _is_path(text: str) -> bool:
 
 
 def algorithms() -> dict[str, type[BaseAlgorithm]]:
-    """Supported algorithms by lower-case name."""
+    """Return the supported algorithms by lower-case name."""
     return {name.lower(): algorithm_named(name) for name in algorithm_names()}

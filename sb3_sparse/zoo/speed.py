@@ -1,4 +1,4 @@
-"""How a process that trains or acts computes."""
+"""Settings that speed up a process that trains or acts."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from stable_baselines3.common.preprocessing import is_image_space
 
 
 def use_few_threads(observation_space: spaces.Space[Any]) -> None:
-    """One thread for networks without convolutions, which more threads only slow down.
+    """Use one thread for networks without convolutions, which more threads only slow down.
 
-    ``OMP_NUM_THREADS`` decides where it is set.
+    ``OMP_NUM_THREADS`` takes precedence if it is set.
     """
     images = isinstance(observation_space, spaces.Dict) or is_image_space(observation_space)
     if "OMP_NUM_THREADS" not in os.environ and not images:
@@ -24,11 +24,11 @@ def use_few_threads(observation_space: spaces.Space[Any]) -> None:
 
 @contextmanager
 def denormals_as_zero() -> Iterator[None]:
-    """Within it, this thread takes numbers below 1.2e-38 as 0.
+    """Treat numbers below 1.2e-38 as 0 in this thread.
 
-    Weight decay drives the weights of units that never fire, and Adam's moments of them, into
-    denormal numbers, with which a processor is slow: a gradient step of the paper's dense DQN
-    takes 29 instead of 4 ms after some thousand steps.
+    Weight decay drives the weights of units that never fire, and their Adam moments, into
+    denormal numbers, which slow a processor down: after a few thousand steps, a gradient step of
+    the paper's dense DQN takes 29 instead of 4 ms.
     """
     before = (th.tensor(1e-38) * 1e-2).item() == 0.0
     th.set_flush_denormal(True)

@@ -1,4 +1,4 @@
-"""YAML as PyYAML reads it, but a key that stands twice in a mapping is refused."""
+"""YAML as PyYAML reads it, except that a repeated key in a mapping is rejected."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ except ImportError as error:
 
 
 class _Loader(yaml.SafeLoader):  # type: ignore[misc]
-    """PyYAML lets the last of equal keys win, so that a setting is lost without a word."""
+    """Rejects repeated keys, of which PyYAML silently keeps the last."""
 
     def construct_mapping(self, node: Any, deep: bool = False) -> Any:
-        # A merge (<<) is taken apart by flatten_mapping, where own keys rightly win: check before.
+        # flatten_mapping expands a merge (<<), where own keys rightly win: check before it does.
         if isinstance(node, yaml.MappingNode) and not hasattr(node, "checked"):
             self._check(node)
         return super().construct_mapping(node, deep)
@@ -34,7 +34,7 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc]
         for key_node, _ in node.value:
             key = "<<" if key_node.tag.endswith(":merge") else self.construct_object(key_node)
             if not isinstance(key, Hashable):
-                continue  # PyYAML refuses it
+                continue  # PyYAML rejects it
             line = key_node.start_mark.line + 1
             if key in first:
                 cure = "give a list, <<: [*a, *b]" if key == "<<" else "keep one"
@@ -45,13 +45,13 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc]
 
 
 def parse(text: str) -> Any:
-    """The content of a YAML text.
+    """Parse a YAML text.
 
-    :raises ConfigError: if it is none, a key stands twice in a mapping, or an alias holds itself
+    :raises ConfigError: if it is invalid, repeats a key in a mapping, or an alias holds itself
     """
     try:
         content = yaml.load(text, Loader=_Loader)
-        json.dumps(content, skipkeys=True, default=str)  # which goes through all of it
+        json.dumps(content, skipkeys=True, default=str)  # visits everything
     except yaml.YAMLError as error:
         raise ConfigError(" ".join(str(error).split())) from error
     except (ValueError, RecursionError) as error:  # !!float x, 2024-99-99, an alias in itself

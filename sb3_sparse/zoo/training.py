@@ -1,4 +1,4 @@
-"""One training run, from names to a folder with model, evaluations and ``sparsity.json``."""
+"""Trains and resumes runs, from names to a folder with model, evaluations and record."""
 
 from __future__ import annotations
 
@@ -59,18 +59,18 @@ def train(
         print(outcome.folder, outcome.sparsity, outcome.results[0].mean_return)
 
     :param callbacks: further callbacks
-    :param tensorboard_log: folder of TensorBoard's files; empty: none
+    :param tensorboard_log: folder for TensorBoard; empty: none
     :param after_evaluation: called after each evaluation; the evaluation is its ``parent``
     :param folder: the run's own folder, ``.../<algo>/<name>``, instead of the next free number in
         ``log_folder``; nothing else may be in it
-    :param watch: is called as a callback, and told of what happens
+    :param watch: called as a callback, and notified of what happens outside training
     :raises ConfigError: if the environment cannot be made or the algorithm cannot act in it
-    :raises Diverged: if networks come to hold NaN; the record has the status ``"diverged"``
+    :raises Diverged: if a network comes to hold NaN; the record gets the status ``"diverged"``
     """
     if tensorboard_log and importlib.util.find_spec("tensorboard") is None:
         raise ConfigError("--tensorboard-log needs TensorBoard: pip install tensorboard")
     if tensorboard_log:
-        tensorboard_log = str(Path(tensorboard_log).absolute())  # also after a resume elsewhere
+        tensorboard_log = str(Path(tensorboard_log).absolute())  # may resume elsewhere
     prepared = prepare(run, log_folder)
     use_few_threads(prepared.observation_space)
     with writing(folder or log_folder, "make it writable, or give another with --log-folder"):
@@ -82,7 +82,7 @@ def train(
     with own.locked():
         if own.has_record:
             raise ConfigError(
-                f"there is a run in {own} already; go on with it by "
+                f"there is already a run in {own}; resume it with "
                 f"{command('train', '--resume', own)}, or give another folder"
             )
         own.write(status=Status.RUNNING, **prepared.record(run), tensorboard_log=tensorboard_log)
@@ -113,10 +113,10 @@ def resume(
 
     :param folder: the run's folder
     :param callbacks: further callbacks
-    :param watch: is called as a callback, and told of what happens
+    :param watch: called as a callback, and notified of what happens outside training
     :raises ConfigError: if there is no run, if it is finished or diverged, or if another process
-        trains it
-    :raises Diverged: if it diverges now
+        is training it
+    :raises Diverged: if it diverges
     """
     own = RunFolder(folder)
     own.record()
@@ -125,14 +125,14 @@ def resume(
         if record.status is Status.FINISHED:
             own.clear_checkpoints()
             raise ConfigError(
-                f"the run in {own} is finished; look at it with {command('enjoy', own)}, or "
-                "train longer anew with -n"
+                f"the run in {own} is finished; evaluate it with {command('enjoy', own)}, or "
+                "train a longer one with -n"
             )
         if record.status is Status.DIVERGED:
             raise ConfigError(f"the run in {own} has ended: {record['error']}")
         with record.reading():
             run, evaluation = record.spec, record.evaluation
-            settings = Settings(record.settings)  # whose dotted paths are imported
+            settings = Settings(record.settings)  # imports dotted paths, as the record does not
             check_settings(settings, run.algorithm)
             if "n_timesteps" not in settings:
                 raise CorruptStateError(
@@ -140,9 +140,8 @@ def resume(
                 )
             tensorboard_log = str(record["tensorboard_log"])
         start = own.start()
-        failure = (
-            f"nothing was changed: the run in {own} cannot go on from {start.folder or 'its start'}"
-        )
+        place = start.folder or "its start"
+        failure = f"nothing was changed: the run in {own} cannot resume from {place}"
         with setup_errors(failure, run.env_id), ExitStack() as stack:
             observation_space, _ = spaces_of(run, settings, own, evaluation)
             use_few_threads(observation_space)
@@ -150,7 +149,7 @@ def resume(
                 check_start(start.folder, run)
             if not start.trained:
                 if start.folder is not None:
-                    Evaluated.read(start.folder)  # all is read before anything is replaced
+                    Evaluated.read(start.folder)  # read everything before replacing anything
                 stack.enter_context(restored_monitors(own.path, start.folder))
             manager = RunManager(run, settings, own, evaluation, start, tensorboard_log)
             model = manager.setup()
@@ -160,7 +159,7 @@ def resume(
 
 
 class _Session:
-    """What one process does of a run: training from its start on, and the last evaluation."""
+    """The work of one process on a run: training from a start point, and the final evaluation."""
 
     def __init__(
         self,
@@ -184,7 +183,7 @@ class _Session:
         self.policy = policy
 
     def outcome(self) -> Outcome:
-        """Bring the run to its end, or to where a signal stops it."""
+        """Train and evaluate the run, unless a signal stops it."""
         episodes = self.manager.evaluation["eval_episodes"]
         with recorded(self.folder, self.run.env_id, self.model):
             envs = self.manager.evaluation_envs(
@@ -230,7 +229,7 @@ class _Session:
         return Outcome(self.folder.path, self.model, results)
 
     def _train(self, evaluation: Evaluation) -> Status:
-        """Train what is left; whether it came to its end or was interrupted."""
+        """Train the remaining steps; return the status that the run has then."""
         start, model = self.manager.start, self.model
         if start.folder is None:
             evaluation.forget()

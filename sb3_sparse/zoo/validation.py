@@ -1,4 +1,4 @@
-"""Settings of a run, checked before anything is trained."""
+"""Checks the settings of a run before anything is trained."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ OF_SPARSITY = frozenset(one.name for one in fields(SparsityConfig))
 
 
 def check_settings(settings: Settings, algorithm: type[BaseAlgorithm]) -> None:
-    """Reject settings that cannot be trained, or not as they say.
+    """Reject settings that cannot be trained as they are.
 
-    :raises ConfigError: for a key that nothing takes, a value that is not allowed, or a sparsity
+    :raises ConfigError: for an unknown key, a value that is not allowed, or a sparsity
         that training would not reach
     """
     kwargs, callback = settings.policy_kwargs, settings.callback
@@ -45,8 +45,8 @@ def check_settings(settings: Settings, algorithm: type[BaseAlgorithm]) -> None:
     stored = issubclass(algorithm, OffPolicyAlgorithm)
     if stored and settings.get("normalize") and settings.get("frame_stack"):
         raise ConfigError(
-            f"normalize and frame_stack do not go together in {algo}: Stable-Baselines3 stores "
-            "observations as they were before both, and not stacked; drop one"
+            f"normalize and frame_stack cannot be combined in {algo}: Stable-Baselines3 stores "
+            "observations as they are before either; drop one"
         )
     if "sparsity" not in kwargs:
         raise ConfigError(SPARSITY_MISSING)
@@ -68,7 +68,7 @@ def _check_keys(given: Mapping[str, Any], allowed: Set[str], what: str, names: N
         elif name in names.algorithm:
             cure = "; it is the algorithm's: put it beside policy_kwargs"
         elif name in SET_BY_THE_RUN:
-            cure = "; it is an option of its own"
+            cure = "; it has its own option"
         else:
             cure = did_you_mean(name, allowed)
         raise ConfigError(f"{what} {name!r}{cure}. Allowed are {', '.join(sorted(allowed))}")
@@ -93,7 +93,7 @@ def _is_number(text: str) -> bool:
 
 
 def _check_start(kwargs: Mapping[str, Any], callback: Mapping[str, Any] | None) -> None:
-    """A denser start needs a method that takes it to the end, and such a method a denser start."""
+    """Require a method that prunes for a denser start, and a denser start for such a method."""
     initial, final = kwargs.get("initial_sparsity"), kwargs["sparsity"]
     shares = list(final.values()) if isinstance(final, Mapping) else [final]
     denser = initial is not None and any(initial < share for share in shares)
@@ -102,7 +102,7 @@ def _check_start(kwargs: Mapping[str, Any], callback: Mapping[str, Any] | None) 
         how = "without a callback" if callback is None else f"with method {callback['method']!r}"
         raise ConfigError(
             f"initial_sparsity: {initial} begins denser than sparsity: {final}, and {how} training "
-            "would stay so; leave initial_sparsity out, or prune with "
+            "would stay that dense; leave initial_sparsity out, or prune with "
             f"callback: [{{{CALLBACK}: {{method: prune}}}}]"
         )
     if prunes and not denser:

@@ -1,4 +1,4 @@
-"""What a run tells whoever watches it."""
+"""Callbacks that report the progress of a run."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from sb3_sparse.zoo.match import Match
 
 
 class Watch(BaseCallback):
-    """A callback that is also told what happens outside training; this one does nothing.
+    """A callback that is also notified of events outside training. The base class does nothing.
 
     Example::
 
@@ -35,26 +35,26 @@ class Watch(BaseCallback):
     """
 
     def begins(self, folder: Path, match: Match | None) -> None:
-        """A run has its folder and its settings; from here on it can be resumed.
+        """Called when a run has its folder and settings; from then on it can be resumed.
 
-        :param match: what was built to match a sparse network's parameters
+        :param match: the parameter match, if the run asks for one
         """
 
     def evaluated(self, step: int, mean: float, std: float, best: float | None) -> None:
-        """An evaluation during training is over.
+        """Called after each evaluation during training.
 
         :param step: environment steps trained
         :param mean: mean episode return
         :param std: its standard deviation over episodes
-        :param best: the best mean return so far; None: no policy had the sparsity asked for yet
+        :param best: the best mean return so far; None: no policy had the requested sparsity yet
         """
 
     def plays(self, what: str, done: int, planned: int) -> None:
-        """Episodes are played after training.
+        """Called while episodes are played after training.
 
-        :param what: whose, e.g. ``"Last policy"``
-        :param done: episodes that are over
-        :param planned: episodes in all
+        :param what: what is going on, e.g. ``"Evaluating the last policy"``
+        :param done: episodes finished
+        :param planned: total number of episodes
         """
 
     def _on_step(self) -> bool:
@@ -62,9 +62,9 @@ class Watch(BaseCallback):
 
 
 class TrainingLog(Watch):
-    """Prints each evaluation, each tenth of the training, and each set of episodes as a line.
+    """Prints a line for each evaluation, tenth of the training, and set of episodes.
 
-    :param say: prints a line; None: print to the standard output of this moment
+    :param say: prints a line; None: print to the current standard output
     """
 
     def __init__(self, say: Callable[[str], None] | None = None) -> None:
@@ -102,9 +102,9 @@ class TrainingLog(Watch):
         return True
 
     def status(self) -> str:
-        """The return of the last episodes, the sparsity, and environment steps per second.
+        """Return the mean return of recent episodes, the sparsity, and steps per second as text.
 
-        The time of evaluations counts, as in SB3's own ``time/fps``.
+        Evaluation time counts, as in SB3's ``time/fps``.
         """
         returns = [float(episode["r"]) for episode in self.model.ep_info_buffer or ()]
         text = f"return {fmean(returns):.1f}" if returns else "return –"
@@ -117,9 +117,9 @@ class TrainingLog(Watch):
 
 
 def counting(tell: Callable[[int], None]) -> Callable[[dict[str, Any], dict[str, Any]], None]:
-    """A callback for SB3's ``evaluate_policy`` that tells how many episodes are over.
+    """Return a callback for SB3's ``evaluate_policy`` that counts finished episodes.
 
-    :param tell: called whenever one more is
+    :param tell: called with the count whenever an episode ends
     """
     told = 0
 

@@ -132,7 +132,7 @@ def test_a_python_object_where_it_would_be_used_is_refused(tmp_path, monkeypatch
 
 def test_a_wrapper_must_be_one():
     check_wrappers({"env_wrapper": ["gymnasium.wrappers.FlattenObservation"]})
-    with pytest.raises(ConfigError, match=r"timeit\.timeit is no subclass of gymnasium"):
+    with pytest.raises(ConfigError, match=r"timeit\.timeit is not a subclass of gymnasium"):
         check_wrappers({"env_wrapper": [{"timeit.timeit": {"setup": "print('run')"}}]})
 
 

@@ -76,7 +76,7 @@ def test_a_zip_in_a_run_is_played_with_all_that_belongs_to_it(folder):
 def test_a_zip_that_does_not_say_its_environment_asks_for_it(tmp_path, mistake):
     make("DQN").save(tmp_path / "model.zip")
     said = mistake("enjoy", "model.zip")
-    assert "model.zip does not say what it was trained in; give --env" in said
+    assert "model.zip does not name its environment; give --env" in said
     said = mistake("enjoy", "model.zip", "--env", "Acrobot-v1")
     assert "model.zip does not suit Acrobot-v1: Observation spaces do not match" in said
 
@@ -106,7 +106,7 @@ def test_statistics_beside_a_lone_zip_are_not_passed_over(tmp_path):
     make("SAC").save(tmp_path / "model.zip")
     envs = VecNormalize(make_vec_env(ENV))
     envs.save(str(tmp_path / "vecnormalize.pkl"))
-    with pytest.raises(ConfigError, match="lies beside .*model.zip: give --vecnormalize"):
+    with pytest.raises(ConfigError, match="is beside .*model.zip: give --vecnormalize"):
         SavedModel.find(tmp_path / "model.zip", env_id=ENV)
     statistics = tmp_path / "vecnormalize.pkl"
     assert (

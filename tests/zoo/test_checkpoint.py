@@ -116,7 +116,7 @@ def test_a_damaged_file_of_a_checkpoint_costs_nothing_of_the_run(name, folder):
 
 def test_a_run_is_not_trained_over_another(folder):
     before = RunFolder(folder).record()
-    with pytest.raises(ConfigError, match="there is a run in .* already; go on with it"):
+    with pytest.raises(ConfigError, match="there is already a run in .*; resume it with"):
         train(RUN, folder=folder)
     assert RunFolder(folder).record() == before
     assert RunFolder(folder).last_checkpoint().name == "500"

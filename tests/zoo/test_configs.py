@@ -10,10 +10,11 @@ from zoo import paper_tables as paper
 
 import sb3_sparse.zoo.configs as configs
 from sb3_sparse.errors import ConfigError
+from sb3_sparse.policies.arguments import arguments_of
 from sb3_sparse.zoo import config_path
 from sb3_sparse.zoo.configs import METHODS, entry_of, evaluation_of
 from sb3_sparse.zoo.environments import is_atari
-from sb3_sparse.zoo.settings import CALLBACK, ZOO_KEYS, Settings, _arguments
+from sb3_sparse.zoo.settings import CALLBACK, ZOO_KEYS, Settings
 from sb3_sparse.zoo.spec import RunSpec, algorithms
 
 SHIPPED = sorted(configs.config_root().glob("*/*.yml"))
@@ -165,10 +166,10 @@ def test_base_values_of_the_others_are_those_of_the_installed_zoo(method, algo):
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: f"{path.parent.name}/{path.stem}")
 def test_every_key_is_known_to_the_algorithm_the_policy_or_the_zoo(path):
     algorithm = algorithms()[path.stem.split("_")[0]]
-    policy = _arguments(algorithm.policy_aliases["SparsePolicy"])
+    policy = arguments_of(algorithm.policy_aliases["SparsePolicy"])
     for key in yaml.safe_load(path.read_text()):
         settings = entry_of(path, key, atari=key == "atari")
-        assert set(settings) <= _arguments(algorithm) | ZOO_KEYS, key
+        assert set(settings) <= arguments_of(algorithm) | ZOO_KEYS, key
         assert set(settings["policy_kwargs"]) <= policy, key
         assert Settings(settings).method == path.parent.name
 

@@ -141,7 +141,7 @@ def test_a_zip_elsewhere_tells_its_algorithm(folder, tmp_path):
         (
             ["--algo", "cautioussac", "--gym-packages", "my_algorithms"]
             + ["--env", "CartPole-v1", "--conf-file", "mine.yml"],
-            "cautioussac cannot act in CartPole-v1.*take dqn or ppo or a2c or qrdqn or trpo",
+            "cautioussac cannot act in CartPole-v1.*use dqn or ppo or a2c or qrdqn or trpo",
         ),
     ],
 )

@@ -189,7 +189,7 @@ def test_a_buffer_of_which_a_part_is_lost_is_refused_and_never_filled_with_zeros
     BufferSaver(buffer).save(tmp_path / "b", 25)
     restore_buffer(KINDS[kind](50), tmp_path / "b")  # as it is, it goes
     spoil(tmp_path / "b" / name)
-    with pytest.raises(ConfigError, match=f"is not whole: {said}.*delete that folder to go on"):
+    with pytest.raises(ConfigError, match=f"is incomplete: {said}.*delete that folder to continue"):
         restore_buffer(KINDS[kind](50), tmp_path / "b")
 
 

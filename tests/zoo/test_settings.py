@@ -183,7 +183,7 @@ def test_wrong_runs_are_refused(arguments, message):
     ],
 )
 def test_overrides_cannot_turn_a_method_into_another(run):
-    with pytest.raises(ConfigError, match=r"makes this 'static' training, not '(dense|rigl)'"):
+    with pytest.raises(ConfigError, match=r"make this 'static' training, not '(dense|rigl)'"):
         run.settings()
 
 

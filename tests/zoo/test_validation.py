@@ -17,7 +17,7 @@ from sb3_sparse.tuning.backend import optuna
 from sb3_sparse.tuning.spaces import check_space
 from sb3_sparse.zoo.arguments import kind_of
 from sb3_sparse.zoo.configs import METHODS, config_root, read_yaml
-from sb3_sparse.zoo.settings import Names
+from sb3_sparse.zoo.settings import Names, Settings
 from sb3_sparse.zoo.spec import RunSpec, algorithms
 from sb3_sparse.zoo.validation import OF_SPARSITY, check_settings
 
@@ -161,7 +161,7 @@ def test_every_shipped_entry_passes():
         for path in (config_root() / method).glob("*.yml"):
             algorithm = algorithms()[path.stem.split("_")[0]]
             for entry in read_yaml(path).values():
-                check_settings(entry, algorithm)
+                check_settings(Settings(entry), algorithm)
                 checked += 1
     assert checked > 200
 
@@ -202,7 +202,7 @@ def test_the_same_table_serves_files_options_studies_and_spaces(tmp_path):
         ({"clip_range": 0.2}, "DQN and rl-zoo have no setting 'clip_range'"),
         ({"sparsity": 0.5}, "put it under policy_kwargs"),
         ({"update_interval": 5}, "put it under sb3_sparse.SparsityCallback"),
-        ({"seed": 3}, "'seed'; it is an option of its own"),
+        ({"seed": 3}, "'seed'; it has its own option"),
         ({3: 4}, "no setting 3"),
         (
             {"policy_kwargs": {"sparsity": 0.5, "net_arc": [4]}},
@@ -225,7 +225,7 @@ def test_the_same_table_serves_files_options_studies_and_spaces(tmp_path):
             "eps is the text '1e-5'.*write eps: !!float 1e-5",
         ),
         ({"noise_type": "normal"}, "noise_type needs noise_std"),
-        ({"normalize": True, "frame_stack": 2}, "normalize and frame_stack do not go together"),
+        ({"normalize": True, "frame_stack": 2}, "normalize and frame_stack cannot be combined"),
         ({"policy_kwargs": {"sparsity": 0.5, "dense_layers": 3}}, "dense_layers must be a list"),
         ({"learning_rate": "nan"}, "learning_rate must be a number, 0 or more"),
     ],
@@ -242,7 +242,7 @@ def test_a_key_that_nothing_takes_is_refused_with_the_nearest_or_its_place(chang
         (0.0, 0.9, None, "begins denser than sparsity: 0.9, and without a callback training would"),
         (0.5, 0.9, None, "without a callback"),
         (0.0, {"q_net": 0.9}, None, "without a callback"),
-        (0.0, 0.9, "rigl", "with method 'rigl' training would stay so"),
+        (0.0, 0.9, "rigl", "with method 'rigl' training would stay that dense"),
         (0.0, 0.9, "static", "with method 'static'"),
         (None, 0.9, "prune", "method 'prune' begins denser than it ends"),
         (0.9, 0.9, "prune", "method 'prune' begins denser"),
