@@ -136,7 +136,7 @@ def test_a_zip_elsewhere_tells_its_algorithm(folder, tmp_path):
         (["--algo", "cautioussac"], "unknown algorithm 'cautioussac'.*--gym-packages names"),
         (
             ["--algo", "cautioussac", "--gym-packages", "my_algorithms"],
-            "no config is shipped for 'cautioussac'.*give it as --conf-file",
+            "no config is shipped for 'cautioussac'.*pass it as --conf-file",
         ),
         (
             ["--algo", "cautioussac", "--gym-packages", "my_algorithms"]
