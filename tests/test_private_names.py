@@ -25,6 +25,7 @@ GATHERED = {"engine/internals.py", "policies/internals.py", "tuning/internals.py
 ELSEWHERE = {
     "_asdict", "_replace",  # named tuples
     "_getframe",  # sys
+    "_predict",  # which SB3 has every policy define
     # rl_zoo3
     "_hyperparams", "_preprocess_hyperparams", "_preprocess_action_noise", "_save_config",
 }  # fmt: skip

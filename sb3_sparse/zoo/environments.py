@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import importlib.util
+import os
 import re
+import traceback
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -88,7 +90,23 @@ def import_packages(names: Iterable[str]) -> None:
 
 
 def _failed(name: str, error: Exception) -> ConfigError:
-    return ConfigError(f"the package {name!r} cannot be imported: {type(error).__name__}: {error}")
+    return ConfigError(
+        f"the package {name!r} cannot be imported: {type(error).__name__}: {error}{place_of(error)}"
+    )
+
+
+def place_of(error: BaseException) -> str:
+    """Return the file and line of a user's code that raised an error; empty for a library's."""
+    while error.__cause__ is not None:
+        error = error.__cause__
+    frames = traceback.extract_tb(error.__traceback__)
+    if not frames or "site-packages" in frames[-1].filename or "<frozen" in frames[-1].filename:
+        return ""
+    path = Path(frames[-1].filename)
+    ours, python = Path(__file__).parents[1], Path(os.__file__).parent
+    if path.is_relative_to(ours) or path.is_relative_to(python):
+        return ""
+    return f" ({path}, line {frames[-1].lineno})"
 
 
 def known_environment(env_id: str) -> None:

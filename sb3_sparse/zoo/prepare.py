@@ -17,6 +17,7 @@ from sb3_sparse.errors import ConfigError, MissingExtra, SparsityError, Unwritab
 from sb3_sparse.policies.registry import registered
 from sb3_sparse.zoo.computing import counts_of
 from sb3_sparse.zoo.disk import refusal
+from sb3_sparse.zoo.environments import place_of
 from sb3_sparse.zoo.folder import RunFolder
 from sb3_sparse.zoo.manager import spaces_of
 from sb3_sparse.zoo.match import Match, match_parameters, untrained_policy
@@ -142,7 +143,7 @@ def setup_errors(failure: str, env_id: str) -> Iterator[None]:
             raise Unwritable(f"{refused}; free space, or make the folder writable") from error
         if _raised_here(error):
             raise
-        raise ConfigError(f"{failure}: {type(error).__name__}: {error}") from error
+        raise ConfigError(f"{failure}: {type(error).__name__}: {error}{place_of(error)}") from error
 
 
 def check_action_space(run: RunSpec, space: spaces.Space[Any]) -> None:
@@ -165,4 +166,7 @@ def check_action_space(run: RunSpec, space: spaces.Space[Any]) -> None:
 def _raised_here(error: BaseException) -> bool:
     """Whether this package's own code raised an error, rather than code that it called."""
     frames = [frame.f_code.co_filename for frame, _ in traceback.walk_tb(error.__traceback__)]
-    return Path(frames[-1]).is_relative_to(PACKAGE)
+    last = Path(frames[-1])
+    return (
+        last.is_relative_to(PACKAGE) and last != PACKAGE / "lazy.py"
+    )  # a name that others ask for

@@ -101,7 +101,10 @@ class Record(Mapping[str, Any]):
             self.status = Status(content.get("status"))
         except ValueError as error:
             found = f"the status {content['status']!r}" if "status" in content else "no status"
-            raise CorruptStateError(f"{source} is damaged: it has {found}; {cure}") from error
+            allowed = ", ".join(Status)
+            raise CorruptStateError(
+                f"{source} is damaged: it has {found}, but allowed are {allowed}; {cure}"
+            ) from error
 
     def __getitem__(self, name: str) -> Any:
         return self._content[name]

@@ -94,7 +94,7 @@ class SavedModel:
     @classmethod
     def find(
         cls,
-        path: Path,
+        path: Path | str,
         *,
         best: bool = False,
         algo: str | None = None,
@@ -317,13 +317,14 @@ class SavedModel:
         (parameters / CONFIG).write_text(settings, encoding="utf-8")
 
 
-def locate(path: Path, best: bool = False) -> tuple[Path, RunFolder]:
+def locate(path: Path | str, best: bool = False) -> tuple[Path, RunFolder]:
     """Return a model's zip and its folder, which may be a run's.
 
     :param path: a run's folder, or a zip, with or without its suffix
     :param best: take a folder's best policy instead of its last
     :raises ConfigError: if a folder holds no run or no such model
     """
+    path = Path(path)
     if not RunFolder(path).is_run:  # a run may have a folder that is named like its zip
         path = zip_path(path)
     if not path.is_dir():

@@ -166,7 +166,7 @@ class Settings(Mapping[str, Any]):
         """Return a setting of the policy, the callback or the algorithm.
 
         :param algorithm: gives the default where the settings lack the name
-        :return: the value; ``"default"`` where the default depends on the method
+        :return: the value; ``"default"`` where neither the settings nor the algorithm have one
         """
         for place in (self["policy_kwargs"], self.callback or {}, self):
             if name in place:
