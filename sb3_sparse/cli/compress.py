@@ -58,9 +58,9 @@ def compress_command(
     The same command resumes an interrupted compression.
     """
     from sb3_sparse.compress import compress_model
+    from sb3_sparse.zoo.computing import use_few_threads
     from sb3_sparse.zoo.folder import RunFolder, env_name
     from sb3_sparse.zoo.saved import SavedModel
-    from sb3_sparse.zoo.speed import use_few_threads
 
     saved = SavedModel.find(
         model,

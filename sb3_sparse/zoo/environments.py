@@ -5,8 +5,10 @@ from __future__ import annotations
 import importlib.util
 import os
 import re
+import sys
 import traceback
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -162,3 +164,39 @@ def suite_of(env_id: str) -> str:
     if game_of(env_id) in CLASSIC_CONTROL:
         return "classic control"
     return "MuJoCo" if game_of(env_id) in MUJOCO else "other tasks"
+
+
+_said: set[str] = set()
+
+
+@contextmanager
+def mujoco_warns_once(env_id: str) -> Iterator[None]:
+    """Print each of MuJoCo's warnings once per process, and write none to a file.
+
+    Outside, MuJoCo prints them all and writes ``MUJOCO_LOG.TXT`` into the current folder.
+
+    :param env_id: environment to make; MuJoCo is imported only if this is one of Gymnasium's own
+        MuJoCo tasks
+    """
+    entry_point = str(getattr(gym.registry.get(env_id), "entry_point", ""))
+    mujoco: Any = sys.modules.get("mujoco")
+    if mujoco is None and "mujoco" in entry_point:
+        with suppress(ImportError):  # Gymnasium reports what is missing
+            mujoco = importlib.import_module("mujoco")
+    if mujoco is None:
+        yield
+        return
+
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(_say)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(before)
+
+
+def _say(message: str) -> None:
+    message = message.strip()
+    if message not in _said:
+        _said.add(message)
+        print(f"MuJoCo warns: {message}", file=sys.stderr)

@@ -18,8 +18,8 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_sparse.errors import MissingExtra, warn
 from sb3_sparse.policies.saving import load_without_buffer
+from sb3_sparse.zoo.environments import mujoco_warns_once
 from sb3_sparse.zoo.folder import REPLAY_BUFFER, RunFolder, Start
-from sb3_sparse.zoo.mujoco import mujoco_warns_once
 from sb3_sparse.zoo.replay import end_episodes, restore_buffer
 from sb3_sparse.zoo.settings import Settings
 from sb3_sparse.zoo.spec import RunSpec, algorithms

@@ -33,6 +33,7 @@ from sb3_sparse.zoo.environments import (
     import_packages,
     is_atari,
     known_environment,
+    mujoco_warns_once,
     package_names,
 )
 from sb3_sparse.zoo.folder import (
@@ -46,7 +47,6 @@ from sb3_sparse.zoo.folder import (
     zip_path,
 )
 from sb3_sparse.zoo.manager import load_for_prediction, loadable_algorithms, quiet
-from sb3_sparse.zoo.mujoco import mujoco_warns_once
 from sb3_sparse.zoo.prepare import setup_errors
 from sb3_sparse.zoo.spec import RunSpec, algorithms
 

@@ -16,7 +16,12 @@ from sb3_sparse.errors import ConfigError, CorruptStateError, command
 from sb3_sparse.policies.base import BaseSparsePolicy
 from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.zoo.checkpoint import Checkpoints, StopTraining, restored_monitors
-from sb3_sparse.zoo.computing import computing_at, counts_of
+from sb3_sparse.zoo.computing import (
+    computing_at,
+    counts_of,
+    denormals_as_zero,
+    use_few_threads,
+)
 from sb3_sparse.zoo.disk import writing
 from sb3_sparse.zoo.divergence import check_networks
 from sb3_sparse.zoo.ending import diverging, recorded
@@ -29,7 +34,6 @@ from sb3_sparse.zoo.results import Outcome, final_results
 from sb3_sparse.zoo.saved import check_start
 from sb3_sparse.zoo.settings import Settings
 from sb3_sparse.zoo.spec import RunSpec
-from sb3_sparse.zoo.speed import denormals_as_zero, use_few_threads
 from sb3_sparse.zoo.validation import check_settings
 from sb3_sparse.zoo.watch import Watch
 

@@ -4,7 +4,7 @@ import gymnasium as gym
 import pytest
 from support import make
 
-from sb3_sparse.zoo.mujoco import mujoco_warns_once
+from sb3_sparse.zoo.environments import mujoco_warns_once
 from sb3_sparse.zoo.saved import SavedModel
 
 mujoco = pytest.importorskip("mujoco")
@@ -12,7 +12,7 @@ mujoco = pytest.importorskip("mujoco")
 
 def test_a_warning_of_mujoco_is_printed_once_and_leaves_no_file(tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("sb3_sparse.zoo.mujoco._said", set())
+    monkeypatch.setattr("sb3_sparse.zoo.environments._said", set())
     before = mujoco.get_mju_user_warning()
     for _ in range(2):
         with mujoco_warns_once("HalfCheetah-v5"):

@@ -7,8 +7,8 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
 
+from sb3_sparse.zoo.computing import denormals_as_zero, use_few_threads
 from sb3_sparse.zoo.spec import RunSpec
-from sb3_sparse.zoo.speed import denormals_as_zero, use_few_threads
 from sb3_sparse.zoo.training import train
 
 VECTOR = spaces.Box(-1.0, 1.0, (4,))
