@@ -13,8 +13,9 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
 import sb3_sparse
+import sb3_sparse.algorithms
 
-NAMES = ("SAC", "TD3", "DDPG", "DQN", "PPO", "A2C")
+NAMES = tuple(sorted({*sb3_sparse.algorithms.__all__} - {"parts"}))
 OFF_POLICY = ("SAC", "TD3", "DDPG", "DQN")
 METHODS = ("static", "set", "rigl", "prune", "dense")
 STORAGES = ("masked", "sparse", "auto")

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import stable_baselines3
 import torch as th
+from algorithms_support import NAMES
 from support import make
 
 import sb3_sparse
-from sb3_sparse.algorithms.table import HOMES
 
 OWN = "Gradient steps are Stable-Baselines3's own: "
 
@@ -61,7 +61,7 @@ def test_without_kernels_gradient_steps_are_sb3s(monkeypatch):
     assert model._n_updates == 20
 
 
-@pytest.mark.parametrize("name", sorted(HOMES))
+@pytest.mark.parametrize("name", NAMES)
 def test_asking_changes_nothing(name):
     ends = []
     for asks in (False, True):

@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 import torch as th
+from algorithms_support import NAMES
 from gymnasium import spaces
 from stable_baselines3 import DQN
 from stable_baselines3.common.preprocessing import preprocess_obs
@@ -16,7 +17,6 @@ from support import make
 from torch.utils.flop_counter import FlopCounterMode
 
 import sb3_sparse
-from sb3_sparse.algorithms.table import HOMES
 from sb3_sparse.analysis import flops
 from sb3_sparse.errors import ConfigError, UnsupportedError
 from sb3_sparse.networks import ImpalaCNN
@@ -98,7 +98,7 @@ def test_gradient_steps_by_hand():
     assert td3.step("critic") == (3 + 1 + 2 / 4 / 2) * td3.forward("critic")
 
 
-@pytest.mark.parametrize("name", sorted(HOMES))
+@pytest.mark.parametrize("name", NAMES)
 def test_gradient_steps_of_our_algorithms_count_as_those_of_stock(name):
     ours = flops(make(getattr(sb3_sparse, name)))
     assert ours.step() == flops(make(name)).step() > 0

@@ -6,13 +6,14 @@ import signal
 
 import pytest
 import stable_baselines3
+from algorithms_support import NAMES
 from rl_zoo3.utils import ALGOS
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from support import ALGORITHMS, make
 
 import sb3_sparse
-from sb3_sparse.algorithms.table import HOMES, trainer_of
+from sb3_sparse.algorithms.table import trainer_of
 from sb3_sparse.zoo.saved import SavedModel
 from sb3_sparse.zoo.spec import RunSpec, algorithms
 from sb3_sparse.zoo.training import resume, train
@@ -24,7 +25,7 @@ RUN = RunSpec(n_timesteps=300, hyperparams=SMALL, eval_freq=100, eval_episodes=1
 @pytest.mark.parametrize("name", sorted(ALGORITHMS))
 def test_the_class_of_an_algorithm_is_ours_where_there_is_one(name):
     found = algorithms()[name.lower()]
-    assert found is (getattr(sb3_sparse, name) if name in HOMES else ALGORITHMS[name])
+    assert found is (getattr(sb3_sparse, name) if name in NAMES else ALGORITHMS[name])
     assert found.__name__ == name
     assert issubclass(found, ALGORITHMS[name])
     assert RunSpec(name.lower(), "CartPole-v1").algorithm is found
@@ -60,7 +61,7 @@ def test_files_of_stock_algorithms_load(tmp_path, name):
     loaded.learn(30)
 
 
-@pytest.mark.parametrize("name", sorted(HOMES))
+@pytest.mark.parametrize("name", NAMES)
 def test_what_trains_ours_is_what_trains_stock(name):
     assert trainer_of(getattr(sb3_sparse, name)) is trainer_of(ALGORITHMS[name])
 

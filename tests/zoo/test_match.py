@@ -11,6 +11,7 @@ from sb3_sparse.errors import ConfigError
 from sb3_sparse.sparsity.distributions import active_counts
 from sb3_sparse.sparsity.widths import mlp_parameters
 from sb3_sparse.zoo.match import match_parameters
+from sb3_sparse.zoo.settings import Settings
 
 VECTOR = spaces.Box(-1, 1, (17,), np.float32)
 ACTIONS = spaces.Box(-1, 1, (6,), np.float32)
@@ -18,7 +19,7 @@ IMAGES = spaces.Box(0, 255, (4, 84, 84), np.uint8)
 
 
 def settings(**policy_kwargs):
-    return {"policy_kwargs": {"sparsity": 0.0, **policy_kwargs}}
+    return Settings({"policy_kwargs": {"sparsity": 0.0, **policy_kwargs}})
 
 
 def best_width(count, target):
