@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import shlex
 import sys
+import sysconfig
+import traceback
 import warnings
 from collections.abc import Collection, Iterable, Mapping
 from difflib import get_close_matches
+from pathlib import Path
 
+HERE = Path(__file__).parent
 BETWEEN = {"sb3_sparse", "stable_baselines3", "sb3_contrib", "rl_zoo3", "optuna", "torch"}
 """Packages whose code may run between a line of the user and the warning."""
 
@@ -67,6 +71,32 @@ def warn(message: str) -> None:
 
 def _package_of(namespace: Mapping[str, object]) -> str:
     return str(namespace.get("__name__", "")).partition(".")[0]
+
+
+def raised_here(error: BaseException) -> bool:
+    """Whether this package's own code raised an error, rather than code that it called."""
+    last = _last_file(error)
+    # lazy.py raises for names that the user's code or settings ask for.
+    return last is not None and last.is_relative_to(HERE) and last != HERE / "lazy.py"
+
+
+def place_of(error: BaseException) -> str:
+    """The file and line of the user's code that raised an error; empty for libraries."""
+    while error.__cause__ is not None:
+        error = error.__cause__
+    last = _last_file(error)
+    paths = sysconfig.get_paths()
+    libraries = (HERE, *(Path(paths[name]) for name in ("stdlib", "purelib", "platlib")))
+    if last is None or any(map(last.is_relative_to, libraries)):
+        return ""
+    return f" ({last}, line {traceback.extract_tb(error.__traceback__)[-1].lineno})"
+
+
+def _last_file(error: BaseException) -> Path | None:
+    """The file of the innermost frame; None without a traceback or without a file."""
+    frames = traceback.extract_tb(error.__traceback__)
+    known = frames and not frames[-1].filename.startswith("<")
+    return Path(frames[-1].filename) if known else None
 
 
 class ConfigError(SparsityError, ValueError):

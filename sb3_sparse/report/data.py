@@ -118,7 +118,7 @@ class RunData:
     @cached_property
     def family(self) -> str:
         """Algorithm, architecture and suite; runs of one family are compared."""
-        extractor = str(self.settings["policy_kwargs"].get("features_extractor_class", ""))
+        extractor = str(self.settings.policy_kwargs.get("features_extractor_class", ""))
         resnet = " with the Impala ResNet" if "impala" in extractor.lower() else ""
         return f"{self.algo.upper()}{resnet} on {suite_of(self.env_id)}"
 
@@ -137,7 +137,7 @@ class RunData:
             return float(matched)
         if self.label == DENSE:
             return 0.0
-        asked = self.settings["policy_kwargs"].get("sparsity")
+        asked = self.settings.policy_kwargs.get("sparsity")
         if isinstance(asked, (int, float)):
             return float(asked)
         return round(float(self.record["total"]["sparsity"]), 3)
@@ -343,8 +343,9 @@ def _check_reached(record: Record) -> None:
 
     :raises ConfigError: with the sparsity that it reached and the one that it should have reached
     """
-    total, kwargs = record["total"], record.settings["policy_kwargs"]
-    reached, asked = float(total["sparsity"]), kwargs.get("sparsity")
+    total, kwargs = record["total"], record.settings.policy_kwargs
+    reached = float(total["sparsity"])
+    asked: Any = kwargs.get("sparsity")
     wanted = total.get("wanted_nnz")
     if wanted is not None:
         missed = abs(int(total["nnz"]) - int(wanted)) > NEAR * int(wanted)

@@ -50,7 +50,7 @@ class Definition:
     @property
     def default_name(self) -> str:
         """The search's name if the user gives none."""
-        sparsity = self.run.settings()["policy_kwargs"]["sparsity"]
+        sparsity = self.run.settings().policy_kwargs["sparsity"]
         shares = sparsity.values() if isinstance(sparsity, Mapping) else [sparsity]
         parts = [self.run.algo, self.run.env_id.replace("/", "-"), self.method]
         searched = "sparsity" in one_of_each(self.space)

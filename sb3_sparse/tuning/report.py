@@ -123,7 +123,7 @@ def _what(definition: Definition, best: FrozenTrial | None) -> str:
     if definition.method == "dense":
         return "dense"
     run = definition.run if best is None else with_values(definition.run, best.user_attrs[VALUES])
-    sparsity = run.settings()["policy_kwargs"]["sparsity"]
+    sparsity = run.settings().policy_kwargs["sparsity"]
     share = f"{100 * sparsity:.4g}%" if isinstance(sparsity, float) else str(sparsity)
     return f"{definition.method} at {share}"
 

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import importlib.util
-import os
 import re
 import sys
-import traceback
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -14,8 +12,25 @@ from typing import Any
 
 import gymnasium as gym
 
-from sb3_sparse.errors import ConfigError, MissingExtra, did_you_mean
+from sb3_sparse.errors import ConfigError, MissingExtra, did_you_mean, place_of
 from sb3_sparse.policies.registry import registered
+
+ATARI = "Atari"
+CLASSIC_CONTROL = ("CartPole", "Acrobot", "MountainCar", "MountainCarContinuous", "Pendulum")
+MUJOCO = (
+    "Ant",
+    "HalfCheetah",
+    "Hopper",
+    "Humanoid",
+    "HumanoidStandup",
+    "InvertedDoublePendulum",
+    "InvertedPendulum",
+    "Pusher",
+    "Reacher",
+    "Swimmer",
+    "Walker2d",
+)
+_said: set[str] = set()
 
 
 def register_atari() -> bool:
@@ -97,20 +112,6 @@ def _failed(name: str, error: Exception) -> ConfigError:
     )
 
 
-def place_of(error: BaseException) -> str:
-    """Return the file and line of a user's code that raised an error; empty for a library's."""
-    while error.__cause__ is not None:
-        error = error.__cause__
-    frames = traceback.extract_tb(error.__traceback__)
-    if not frames or "site-packages" in frames[-1].filename or "<frozen" in frames[-1].filename:
-        return ""
-    path = Path(frames[-1].filename)
-    ours, python = Path(__file__).parents[1], Path(os.__file__).parent
-    if path.is_relative_to(ours) or path.is_relative_to(python):
-        return ""
-    return f" ({path}, line {frames[-1].lineno})"
-
-
 def known_environment(env_id: str) -> None:
     """Raise if an environment does not exist.
 
@@ -134,23 +135,6 @@ def is_atari(env_id: str) -> bool:
     return "AtariEnv" in str(gym.registry[env_id].entry_point)
 
 
-ATARI = "Atari"
-CLASSIC_CONTROL = ("CartPole", "Acrobot", "MountainCar", "MountainCarContinuous", "Pendulum")
-MUJOCO = (
-    "Ant",
-    "HalfCheetah",
-    "Hopper",
-    "Humanoid",
-    "HumanoidStandup",
-    "InvertedDoublePendulum",
-    "InvertedPendulum",
-    "Pusher",
-    "Reacher",
-    "Swimmer",
-    "Walker2d",
-)
-
-
 def game_of(env_id: str) -> str:
     """Return a task's name without its version, e.g. ``"Pong"`` for ``"ALE/Pong-v5"``."""
     name = re.sub(r"-v\d+$", "", env_id.split("/")[-1])
@@ -164,9 +148,6 @@ def suite_of(env_id: str) -> str:
     if game_of(env_id) in CLASSIC_CONTROL:
         return "classic control"
     return "MuJoCo" if game_of(env_id) in MUJOCO else "other tasks"
-
-
-_said: set[str] = set()
 
 
 @contextmanager

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -13,19 +12,23 @@ import gymnasium as gym
 import torch as th
 from gymnasium import spaces
 
-from sb3_sparse.errors import ConfigError, MissingExtra, SparsityError, Unwritable
+from sb3_sparse.errors import (
+    ConfigError,
+    MissingExtra,
+    SparsityError,
+    Unwritable,
+    place_of,
+    raised_here,
+)
 from sb3_sparse.policies.registry import registered
 from sb3_sparse.zoo.computing import counts_of
 from sb3_sparse.zoo.disk import refusal
-from sb3_sparse.zoo.environments import place_of
 from sb3_sparse.zoo.folder import RunFolder
 from sb3_sparse.zoo.manager import spaces_of
 from sb3_sparse.zoo.match import Match, match_parameters, untrained_policy
 from sb3_sparse.zoo.record import Status, versions
 from sb3_sparse.zoo.settings import Settings
 from sb3_sparse.zoo.spec import RunSpec
-
-PACKAGE = Path(__file__).parents[1]
 
 
 @dataclass(frozen=True)
@@ -141,7 +144,7 @@ def setup_errors(failure: str, env_id: str) -> Iterator[None]:
         refused = refusal(error, Path())
         if refused is not None:
             raise Unwritable(f"{refused}; free space, or make the folder writable") from error
-        if _raised_here(error):
+        if raised_here(error):
             raise
         raise ConfigError(f"{failure}: {type(error).__name__}: {error}{place_of(error)}") from error
 
@@ -161,12 +164,3 @@ def check_action_space(run: RunSpec, space: spaces.Space[Any]) -> None:
             f"{run.algo} cannot act in {run.env_id}, whose actions are {space}; "
             + (f"use {' or '.join(able)}" if able else "no algorithm can")
         )
-
-
-def _raised_here(error: BaseException) -> bool:
-    """Whether this package's own code raised an error, rather than code that it called."""
-    frames = [frame.f_code.co_filename for frame, _ in traceback.walk_tb(error.__traceback__)]
-    last = Path(frames[-1])
-    return (
-        last.is_relative_to(PACKAGE) and last != PACKAGE / "lazy.py"
-    )  # a name that others ask for

@@ -71,7 +71,7 @@ class Settings(Mapping[str, Any]):
         self._imports = imports
 
     def __getitem__(self, name: str) -> Any:
-        return self._content[name]
+        return deepcopy(self._content[name])
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._content)
@@ -88,8 +88,9 @@ class Settings(Mapping[str, Any]):
 
     @property
     def policy_kwargs(self) -> dict[str, Any]:
-        """A copy of the policy's arguments."""
-        return deepcopy(self._content["policy_kwargs"])
+        """The policy's arguments."""
+        kwargs: dict[str, Any] = self["policy_kwargs"]
+        return kwargs
 
     @property
     def callback(self) -> Mapping[str, Any] | None:
@@ -98,7 +99,7 @@ class Settings(Mapping[str, Any]):
         :raises ConfigError: if a callback has another form, or lacks its method
         """
         found = _sparsity_callback(self._content, self._imports)
-        return None if found is None else found[1]
+        return None if found is None else deepcopy(found[1])
 
     @property
     def has_own_callback(self) -> bool:
@@ -118,9 +119,10 @@ class Settings(Mapping[str, Any]):
                 f"the policy must be {POLICY} (with sparsity 0.0 for dense training), got "
                 f"{policy!r}"
             )
-        if self.callback is not None:
-            return method_named(self.callback["method"]).name
-        sparsity = self["policy_kwargs"].get("sparsity")
+        callback = self.callback
+        if callback is not None:
+            return method_named(callback["method"]).name
+        sparsity = self.policy_kwargs.get("sparsity")
         shares = list(sparsity.values()) if isinstance(sparsity, Mapping) else [sparsity]
         return DENSE if all(share == 0.0 for share in shares) else "static"
 
@@ -168,7 +170,7 @@ class Settings(Mapping[str, Any]):
         :param algorithm: gives the default where the settings lack the name
         :return: the value; ``"default"`` where neither the settings nor the algorithm have one
         """
-        for place in (self["policy_kwargs"], self.callback or {}, self):
+        for place in (self.policy_kwargs, self.callback or {}, self):
             if name in place:
                 return place[name]
         if name == "weight_decay":
@@ -190,12 +192,12 @@ class Settings(Mapping[str, Any]):
         :param without: further names to omit
         """
         hidden = {*COMPARED, *without}
-        parts = {"policy_kwargs": self["policy_kwargs"], "callback": self.callback or {}}
-        kept = {
-            part: {name: value for name, value in values.items() if name not in hidden}
-            for part, values in {"": self, **parts}.items()
-        }
-        return json.dumps({**kept.pop(""), **kept}, sort_keys=True, default=str)
+
+        def kept(values: Mapping[str, Any]) -> dict[str, Any]:
+            return {name: value for name, value in values.items() if name not in hidden}
+
+        parts = {"policy_kwargs": kept(self.policy_kwargs), "callback": kept(self.callback or {})}
+        return json.dumps({**kept(self), **parts}, sort_keys=True, default=str)
 
 
 @dataclass(frozen=True)

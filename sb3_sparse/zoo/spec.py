@@ -49,7 +49,7 @@ class RunSpec:
         from sb3_sparse.zoo import RunSpec
 
         run = RunSpec(algo="sac", env_id="Pendulum-v1", method="rigl", sparsity=0.9, seed=1)
-        print(run.settings()["policy_kwargs"])
+        print(run.settings().policy_kwargs)
 
     :param algo: algorithm, e.g. ``"sac"``
     :param env_id: Gymnasium id; ``"package:Id-v0"`` is ``"Id-v0"`` with one more package

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 
+import numpy as np
 import pytest
 import stable_baselines3
 from algorithms_support import NAMES
@@ -49,6 +50,8 @@ def test_runs_train_and_go_on_with_our_class(tmp_path):
     saved = SavedModel.find(stopped.folder)
     assert type(saved.load()) is sb3_sparse.DQN
     assert type(saved.load(make_vec_env("CartPole-v1"))) is sb3_sparse.DQN
+    observation = np.zeros(4, np.float32)
+    assert saved.policy().predict(observation)[0] in (0, 1)
     stock = stable_baselines3.DQN.load(saved.path)
     assert stock.num_timesteps == 300
 

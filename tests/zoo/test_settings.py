@@ -261,6 +261,9 @@ def test_settings_keep_what_they_were_made_of():
     content["policy_kwargs"]["sparsity"] = 0.1
     settings.policy_kwargs["sparsity"] = 0.2
     settings.as_dict()["policy_kwargs"]["sparsity"] = 0.3
+    settings["policy_kwargs"]["sparsity"] = 0.4
+    settings.callback["update_interval"] = 8
+    assert settings.callback["update_interval"] == 7
     assert settings["policy_kwargs"]["sparsity"] == 0.9
     assert settings.replaced(learning_rate=0.3)["learning_rate"] == 0.3
     assert settings["learning_rate"] == 0.1
