@@ -59,7 +59,7 @@ def write_csv(
 ) -> None:
     """Write a table as a CSV file, whole or not at all.
 
-    :param path: of the file
+    :param path: file to write
     :param heads: names of the columns
     :param rows: an entry for each column; None leaves its field empty
     :param digits: significant digits of floats, and NaN leaves its field empty; None: floats are

@@ -1,4 +1,4 @@
-"""Packages whose names are imported when somebody asks for them."""
+"""Packages that import their names on first access."""
 
 from __future__ import annotations
 
@@ -15,13 +15,12 @@ def lazily(
 ) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
     """``__getattr__`` and ``__dir__`` of a package that imports its modules as they are needed.
 
-    So you can import a light module in it, one that knows names for instance, without those that
-    need torch. What the package imports ``if TYPE_CHECKING`` are the names, and where they are. No
-    name may be that of a module in the package: which of the two it is would depend on what was
-    imported before.
+    Light modules of the package can thus be imported without torch. The names, and the modules that
+    define them, are those of its ``if TYPE_CHECKING`` imports. No name may be that of a module of
+    the package: what it meant would then depend on earlier imports.
 
     :param package: its ``__name__``
-    :param absent: what to say of names that the package might be expected to have
+    :param absent: messages for names that users may expect but the package lacks
     """
     homes = {
         alias.name: node.module

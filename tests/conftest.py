@@ -14,7 +14,7 @@ th.set_num_threads(1)
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-@pytest.fixture(params=library.instruction_sets() if library.why_missing() is None else [])
+@pytest.fixture(params=library.instruction_sets())
 def instructions(request):
     """One instruction set after the other."""
     before = library.in_use()

@@ -36,7 +36,7 @@ def test_an_error_leaves_the_old_file_and_nothing_else(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_two_writers_of_one_file_do_not_meet(tmp_path):
+def test_two_possible_algorithms_one_file_do_not_meet(tmp_path):
     path = tmp_path / "scores.txt"
     with written_whole(path) as first, written_whole(path) as second:
         first.write_text("first")

@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from sb3_sparse.algorithms.ppo import PPO
     from sb3_sparse.algorithms.sac import SAC
     from sb3_sparse.algorithms.td3 import DDPG, TD3
-    from sb3_sparse.algorithms.training import parts
 
-__all__ = ["A2C", "DDPG", "DQN", "PPO", "SAC", "TD3", "parts"]
+__all__ = ["A2C", "DDPG", "DQN", "PPO", "SAC", "TD3"]
 __getattr__, __dir__ = lazily(__name__)

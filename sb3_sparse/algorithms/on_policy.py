@@ -13,12 +13,13 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
 from stable_baselines3.common.utils import explained_variance
 
-from sb3_sparse.algorithms.training import Fused, Methods, features, parts
+from sb3_sparse.algorithms.training import Fused, Methods, features
 from sb3_sparse.fused.distributions import bernoulli, categorical, gaussian, multi_categorical
 from sb3_sparse.fused.errors import NotCovered
 from sb3_sparse.fused.inputs import TYPES
 from sb3_sparse.fused.machine import Machine
 from sb3_sparse.fused.optimizers import KNOWN, Known, rmsprop
+from sb3_sparse.fused.parts import parts
 from sb3_sparse.fused.program import Program
 from sb3_sparse.fused.values import Value
 from sb3_sparse.policies.fast_forward import takes_vectors
@@ -60,7 +61,7 @@ class Minibatch(NamedTuple):
 class OnPolicy(Fused, OnPolicyAlgorithm):
     """Base class of algorithms that learn from rollouts by fused gradient steps.
 
-    A subclass defines ``_record`` and ``_train_fused``, as PPO does.
+    A subclass defines ``_next_machine``, ``_record`` and ``_train_fused``, as PPO does.
     """
 
     def _record_policy(self, program: Program) -> tuple[Value, Value, Value]:

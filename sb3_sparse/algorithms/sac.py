@@ -11,9 +11,9 @@ import torch as th
 from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN
 
 from sb3_sparse.algorithms.off_policy import OffPolicy
-from sb3_sparse.algorithms.training import parts
 from sb3_sparse.fused.distributions import least_of, squashed_gaussian
 from sb3_sparse.fused.machine import Machine
+from sb3_sparse.fused.parts import parts
 from sb3_sparse.fused.program import Program
 
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from importlib import import_module
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
-if TYPE_CHECKING:  # which is imported when an algorithm is, not when one is named
+if TYPE_CHECKING:  # imported when an algorithm is, not when one is named
     from stable_baselines3.common.base_class import BaseAlgorithm
+
+T = TypeVar("T")
 
 
 def algorithm_named(name: str) -> type[BaseAlgorithm]:
@@ -36,3 +39,18 @@ def trainer_of(algorithm: type[BaseAlgorithm]) -> type:
         ),
         algorithm,
     )
+
+
+def nearest(algorithm: type[BaseAlgorithm], known: Mapping[type, T]) -> T | None:
+    """Find the entry of an algorithm, or of the nearest base class with the same ``train()``.
+
+    :param algorithm: any algorithm class, including a user's own
+    :param known: entries by algorithm class
+    """
+    trainer = trainer_of(algorithm)
+    for cls in algorithm.__mro__:
+        if cls in known:
+            return known[cls]
+        if cls is trainer:
+            break
+    return None

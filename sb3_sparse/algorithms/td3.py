@@ -7,8 +7,8 @@ import stable_baselines3
 import torch as th
 
 from sb3_sparse.algorithms.off_policy import OffPolicy
-from sb3_sparse.algorithms.training import parts
 from sb3_sparse.fused.distributions import least_of
+from sb3_sparse.fused.parts import parts
 from sb3_sparse.fused.program import Program
 
 

@@ -16,24 +16,21 @@ from stable_baselines3.common.preprocessing import preprocess_obs
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
-from sb3_sparse.engine.activations import ACTIVATIONS, ADJUSTABLE, number_of
+from sb3_sparse.engine.activations import ADJUSTABLE, number_of
 from sb3_sparse.engine.changes import ChangeDetector, patched
 from sb3_sparse.engine.internals import any_global_hook, module_hooks
-from sb3_sparse.engine.linear import SparseLinear
 from sb3_sparse.engine.native.library import why_missing
-from sb3_sparse.engine.paths import parts_of
 from sb3_sparse.errors import UnsupportedError
 from sb3_sparse.fused.errors import NotCovered
 from sb3_sparse.fused.machine import Machine
-from sb3_sparse.fused.program import Parts, Program
+from sb3_sparse.fused.program import Program
 from sb3_sparse.policies.base import BaseSparsePolicy
 from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.policies.fast_forward import only_flattens, overrides, takes_vectors
-from sb3_sparse.policies.registry import registered, writers_of
+from sb3_sparse.policies.registry import possible_algorithms, registered
 from sb3_sparse.policies.storage import KNOWN_PACKAGES
 
 SEEN = attrgetter("requires_grad", "_backward_hooks", "_post_accumulate_grad_hooks")
-KNOWN_MODULES = (nn.Linear, SparseLinear, nn.Identity, *ACTIVATIONS)
 Build = Callable[[Program], None]
 Methods = dict[str, tuple[str, ...]]
 """The methods that SB3's ``train()`` calls, by the dotted name of their module ("": the policy)."""
@@ -186,26 +183,6 @@ def _trained(policy: BaseSparsePolicy) -> Iterable[th.Tensor]:
             yield from group["params"]
 
 
-def parts(*modules: nn.Module) -> Parts:
-    """Split a network into linear layers and activations, for ``program.network``.
-
-    Example::
-
-        from torch import nn
-        from sb3_sparse.algorithms import parts
-
-        parts(nn.Linear(3, 8), nn.ReLU(), nn.Linear(8, 1))  # two layers, one with an activation
-
-    :raises NotCovered: if it has any other module
-    """
-    found = parts_of(modules)
-    if found is None:
-        inner = (m for module in modules for m in module.modules() if not list(m.children()))
-        others = {type(m).__name__ for m in inner if type(m) not in KNOWN_MODULES}
-        raise NotCovered(f"a network with {', '.join(sorted(others)) or 'modules of its own'}")
-    return found
-
-
 def features(policy: BasePolicy, obs: Any) -> th.Tensor:
     """Convert observations of a buffer to the input of the networks, in a type programs read.
 
@@ -245,7 +222,7 @@ class Fused(BaseAlgorithm):
         """
         policy, known = self.policy_class, registered().values()
         own = [one.stock_policy for one in known if isinstance(self, one.algorithm)]
-        others = writers_of(policy)
+        others = possible_algorithms(policy)
         if others and not issubclass(policy, tuple(own)):
             name = type(self).__name__
             raise UnsupportedError(

@@ -10,7 +10,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 
-from sb3_sparse.algorithms.table import trainer_of
+from sb3_sparse.algorithms.table import nearest
 from sb3_sparse.analysis.networks import modules_of, prunable_of, specs_of
 from sb3_sparse.engine.network import SparseNetwork
 from sb3_sparse.errors import ConfigError
@@ -187,15 +187,14 @@ def passes_of(model: BaseAlgorithm) -> list[PassCounts]:
 
     :raises ConfigError: for an algorithm whose ``train()`` is none of the known ones
     """
-    trainer = trainer_of(type(model))
-    known = {name: one for name, one in registered().items() if one.passes is not None}
-    for one in known.values():
-        if one.passes is not None and trainer_of(one.algorithm) is trainer:
-            return one.passes(model)
+    known = {one.algorithm: one.passes for one in registered().values() if one.passes is not None}
+    passes = nearest(type(model), known)
+    if passes is not None:
+        return passes(model)
     raise ConfigError(
         f"how often {type(model).__name__} runs its networks in a gradient step is not known; it "
-        f"is for {', '.join(known)}. Give its passes to sb3_sparse.register_policy, or call "
-        "flops(model.policy), which counts forward passes alone"
+        f"is known for {', '.join(one.__name__ for one in known)}. Give its passes to "
+        "sb3_sparse.register_policy, or call flops(model.policy), which counts forward passes alone"
     )
 
 

@@ -13,7 +13,7 @@ from stable_baselines3 import DQN, PPO, SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
 from torch.nn import functional as F
 
-from sb3_sparse.algorithms.table import trainer_of
+from sb3_sparse.algorithms.table import nearest
 from sb3_sparse.engine.internals import pytree
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.policies.internals import progress_remaining
@@ -55,11 +55,12 @@ def register_losses(algorithm: type[BaseAlgorithm]) -> Callable[[MakeLosses], Ma
 
     It takes a model, a twin of its policy with dense weights, and a minibatch.
 
-    :param algorithm: class that defines ``train()``, or inherits it
+    :param algorithm: class of the algorithm; its subclasses with the same ``train()`` have the same
+        losses, unless others are registered for them
     """
 
     def register(losses: MakeLosses) -> MakeLosses:
-        _losses[trainer_of(algorithm)] = losses
+        _losses[algorithm] = losses
         return losses
 
     return register
@@ -178,7 +179,7 @@ def losses_for(algorithm: type[BaseAlgorithm]) -> MakeLosses:
 
     :raises ConfigError: for an algorithm whose ``train()`` is none of the known ones
     """
-    losses = _losses.get(trainer_of(algorithm))
+    losses = nearest(algorithm, _losses)
     if losses is None:
         raise ConfigError(
             f"gradient_snr has no loss of {algorithm.__name__}; supported are "

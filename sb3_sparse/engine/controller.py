@@ -82,9 +82,6 @@ class Controller:
     def _owned_by(self, optimizer: th.optim.Optimizer) -> list[SparseNetwork]:
         return [network for network in self.networks if network.optimizer is optimizer]
 
-    def _sparse_layers(self, networks: Iterable[SparseNetwork]) -> Iterable[LayerStorage]:
-        return chain.from_iterable(network.sparse_layers for network in networks)
-
     def attach(self) -> None:
         """Register the hooks, unless these very weights and optimizers have them already."""
         changed = self._attach_to_gradients()
@@ -93,7 +90,7 @@ class Controller:
 
     def _attach_to_gradients(self) -> bool:
         """Register the hooks on gradients alone; tell whether they were missing."""
-        layers = self._sparse_layers(self.networks)
+        layers = _sparse_layers(self.networks)
         weights = [layer.weight for layer in layers if not layer.frozen]
         return self._gradient_hooks.attach(weights, self._hook_gradients)
 
@@ -168,7 +165,7 @@ class Controller:
         self.choose_storage(root)
         if not self._in_force():
             self.plan = None  # left from an interrupted training
-        for layer in self._sparse_layers(self.networks):
+        for layer in _sparse_layers(self.networks):
             if layer.gradient is not None:
                 layer.gradient.dense_grad = None
             layer.remask()
@@ -176,12 +173,12 @@ class Controller:
 
     def enforce(self) -> None:
         """Set inactive weights to 0 in case they have been written."""
-        for layer in self._sparse_layers(self.networks):
+        for layer in _sparse_layers(self.networks):
             layer.remask()
 
     def enforce_if_written(self) -> None:
         """As :meth:`enforce`, but only for weights that torch has seen written since."""
-        for layer in self._sparse_layers(self.networks):
+        for layer in _sparse_layers(self.networks):
             layer.remask_if_written()
 
     def start(self, plan: Plan, soft_targets: bool, in_force: Callable[[], bool]) -> None:
@@ -238,12 +235,12 @@ class Controller:
 
     def _accept_writes(self, optimizer: th.optim.Optimizer, args: object, kwargs: object) -> None:
         """Runs after the step of an optimizer that keeps weights at 0 whose gradient is 0."""
-        for layer in self._sparse_layers(self._owned_by(optimizer)):
+        for layer in _sparse_layers(self._owned_by(optimizer)):
             layer.accept_writes()
 
     def _after_step(self, optimizer: th.optim.Optimizer, args: object, kwargs: object) -> None:
         """Runs after the step of an optimizer that writes to inactive weights."""
-        for layer in self._sparse_layers(self._owned_by(optimizer)):
+        for layer in _sparse_layers(self._owned_by(optimizer)):
             layer.remask()
 
     def needs_torch(self, optimizer: th.optim.Optimizer) -> bool:
@@ -293,3 +290,7 @@ class Controller:
         update = plan.update_at(network.clock, self.progress, self.seed)
         at_once = plan.update_on == "step"
         network.move(plan.topology, update, gradients, self.optimizers, self.soft_targets, at_once)
+
+
+def _sparse_layers(networks: Iterable[SparseNetwork]) -> Iterable[LayerStorage]:
+    return chain.from_iterable(network.sparse_layers for network in networks)

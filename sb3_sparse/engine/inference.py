@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import ctypes
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from itertools import chain
 from typing import Any, NamedTuple
 
@@ -22,7 +22,7 @@ from torch.compiler import is_compiling
 from sb3_sparse.engine.activations import ADJUSTABLE, number_of
 from sb3_sparse.engine.buffer import FloatBuffer
 from sb3_sparse.engine.chains import watched
-from sb3_sparse.engine.changes import ChangeDetector, patched
+from sb3_sparse.engine.changes import patched
 from sb3_sparse.engine.internals import any_global_hook, watching
 from sb3_sparse.engine.linear import TRIES, SparseLinear
 from sb3_sparse.engine.masked import FLOAT_MASK_KEY, MaskedStorage
@@ -289,30 +289,3 @@ class Inference:
 def _tensors_of(layer: nn.Linear) -> tuple[th.Tensor | None, ...]:
     """Return the weight, bias and mask of a layer."""
     return layer.weight, layer.bias, layer._buffers.get(FLOAT_MASK_KEY)
-
-
-class KeptInference:
-    """Creates an inference anew whenever modules have changed. Copies and pickles start empty."""
-
-    def __init__(self) -> None:
-        self._changes: ChangeDetector | None = None
-        self._inference: Inference | None = None
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> KeptInference:
-        return KeptInference()
-
-    def __reduce__(self) -> Any:
-        return KeptInference, ()
-
-    def get(self, find: Callable[[], tuple[Paths, list[nn.Module]]]) -> Inference | None:
-        """Return the inference; None where the modules must be called one by one.
-
-        :param find: gives the paths, and the modules around them from the outermost inwards; hooks
-            of the outermost run in any case, those of the others would be skipped
-        """
-        if self._changes is None or not self._changes.unchanged():
-            paths, around = find()
-            changes = ChangeDetector([*around, *modules_of(paths)])
-            self._inference = Inference.of(paths, around[1:])
-            self._changes = changes  # last, for other threads
-        return self._inference

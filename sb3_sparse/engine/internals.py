@@ -14,9 +14,7 @@ from torch import nn
 from torch.autograd import forward_ad
 from torch.nn.modules.module import _has_any_global_hook
 from torch.optim import optimizer as torch_optimizer
-from torch.utils import _pytree as pytree
-
-__all__ = ["any_global_hook", "pytree"]
+from torch.utils import _pytree
 
 Module = TypeVar("Module", bound=nn.Module)
 
@@ -38,6 +36,7 @@ WRAPPED = "_orig_mod"
 """Where ``torch.compile`` keeps the module that it has wrapped."""
 
 any_global_hook: Any = _has_any_global_hook
+pytree: Any = _pytree
 """Whether a hook is registered for all modules."""
 module_hooks: Any = itemgetter(*MODULE_HOOKS)
 """The hooks on the calls of a module, given its ``vars``."""
@@ -78,7 +77,7 @@ def become(module: nn.Module, cls: type[Module]) -> Module:
 
 
 def replace_data(parameter: nn.Parameter, data: th.Tensor) -> None:
-    """Return a Parameter other data, perhaps of another size; it stays the same object.
+    """Give a Parameter other data, perhaps of another size; it stays the same object.
 
     While a graph of an earlier pass is alive, autograd keeps the node that accumulates the
     gradient, and with it the old size. Setting ``data`` of another type makes it drop the node, so

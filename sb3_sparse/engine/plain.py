@@ -10,7 +10,7 @@ from sb3_sparse.engine.sequential import ChainedSequential, unchain
 
 
 def make_plain(root: nn.Module) -> None:
-    """Return every layer below ``root`` its dense weight, 0 where inactive.
+    """Give every layer below ``root`` its dense weight back, 0 where inactive.
 
     This removes the masks, hooks and classes of this package. Optimizers do not follow, so apply it
     to copies.

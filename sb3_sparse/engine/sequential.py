@@ -10,8 +10,9 @@ from torch import nn
 
 from sb3_sparse.engine.activations import ACTIVATIONS, ADJUSTABLE, tells_its_slope
 from sb3_sparse.engine.chains import Chain, watched
-from sb3_sparse.engine.inference import KeptInference, by_modules
+from sb3_sparse.engine.inference import by_modules
 from sb3_sparse.engine.internals import MODULE_HOOKS, any_global_hook, become
+from sb3_sparse.engine.kept import KeptInference
 from sb3_sparse.engine.linear import SparseLinear
 
 ELEMENTWISE = (*ACTIVATIONS, nn.Identity)

@@ -13,6 +13,7 @@ from sb3_sparse.fused.distributions import (
     squashed_gaussian,
 )
 from sb3_sparse.fused.errors import NotCovered
+from sb3_sparse.fused.parts import parts
 from sb3_sparse.fused.program import Program
 from sb3_sparse.fused.values import Value
 
@@ -25,5 +26,6 @@ __all__ = [
     "gaussian",
     "least_of",
     "multi_categorical",
+    "parts",
     "squashed_gaussian",
 ]

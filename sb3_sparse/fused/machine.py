@@ -160,7 +160,7 @@ class Machine:
             if by_kernels and not self.controller.needs_torch(minimised.optimizer):
                 continue
             self._go(first, step, failed)
-            self._step_by_torch(minimised)
+            self._step_by_torch(minimised, step)
             first = step + 1
         self._go(first, last, failed)
 
@@ -181,16 +181,19 @@ class Machine:
                 self.controller.count_step(minimised.optimizer)
                 self.tables.count(minimised)
 
-    def _step_by_torch(self, minimised: Minimised) -> None:
+    def _step_by_torch(self, minimised: Minimised, step: int) -> None:
         optimizer = minimised.optimizer
         self.tables.hand_over(minimised)
         optimizer.step()
         optimizer.zero_grad(set_to_none=True)
         self.prepare()
-        self._repack()
+        self._repack(step)
 
-    def _repack(self) -> None:
-        """Read weights again that were written or have moved in memory."""
-        for i, operation in enumerate(self.operations):
-            if operation.kind in ("PACK", "TURN"):  # in this order, since weights come first
+    def _repack(self, step: int) -> None:
+        """Read weights again that a step wrote or moved in memory.
+
+        :param step: index of the step; operations after it run again anyway
+        """
+        for i, operation in enumerate(self.operations[:step]):
+            if operation.kind in ("PACK", "TURN"):  # a layer's PACK comes before its TURN
                 self._go(i, i + 1)

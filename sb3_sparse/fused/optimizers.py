@@ -106,7 +106,7 @@ class Steps:
             return
         optimizer = self._optimizer
         settings = list(map(self._getter, optimizer.param_groups))
-        hooks = ["step" in vars(optimizer), *map(len, step_hooks(self._optimizer))]
+        hooks = ["step" in vars(optimizer), *map(len, step_hooks(optimizer))]
         if settings == self._settings and hooks == self._hooks:
             return
         self._settings, self._hooks = settings, hooks

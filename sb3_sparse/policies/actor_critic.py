@@ -32,7 +32,7 @@ def on_policy_passes(model: Any) -> list[PassCounts]:
     return [PassCounts(name, 1, 1, shares=False) for name in ("actor", "critic")]
 
 
-@register_policy(PPO, passes=on_policy_passes, told_by="clip_range")
+@register_policy(PPO, passes=on_policy_passes, own_attribute="clip_range")
 @register_policy(A2C, passes=on_policy_passes)
 class SparseActorCriticPolicy(BaseSparsePolicy, ActorCriticPolicy):
     """Sparse actor and value network for PPO, A2C and TRPO; a shared extractor is the actor's.

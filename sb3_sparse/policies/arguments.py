@@ -44,13 +44,15 @@ def import_classes(kwargs: dict[str, Any]) -> None:
 
 
 @cache
-def arguments_of(cls: type) -> frozenset[str]:
+def arguments_of(cls: type, start: type | None = None) -> frozenset[str]:
     """Names of a class's keyword arguments, without those that every SB3 class is given.
 
     A constructor with ``**kwargs`` takes the arguments of its base class, too.
+
+    :param start: the base class whose constructor gets the arguments; None: ``cls`` itself
     """
     names: set[str] = set()
-    for base in cls.__mro__:
+    for base in cls.__mro__[cls.__mro__.index(start or cls) :]:
         if "__init__" not in vars(base):
             continue
         parameters = inspect.signature(vars(base)["__init__"]).parameters

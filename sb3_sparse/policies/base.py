@@ -93,7 +93,7 @@ class BaseSparsePolicy(DenseVectors, FastPredict):
                 "without gradients, such as ARS, have no sparse policy; "
                 "sb3_sparse.supported_algorithms() lists those that have one"
             )
-        known = sorted(arguments_of(type(self)))
+        known = sorted(arguments_of(type(self), BaseSparsePolicy))
         for name in kwargs:
             check_choice(f"argument of {type(self).__name__}", name, known)
         config = SparsityConfig.pop_from(kwargs)
@@ -246,15 +246,18 @@ class BaseSparsePolicy(DenseVectors, FastPredict):
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
         config = self.sparsity_config
-        data.update(vars(config), dense_layers=list(config.dense_layers))
-        data["weight_decay"] = self.sparse.weight_decay
+        dense_layers, weight_decay = list(config.dense_layers), self.sparse.weight_decay
+        data.update(vars(config), dense_layers=dense_layers, weight_decay=weight_decay)
         if hasattr(self, "share_features_extractor"):  # SB3 forgets it for some of its policies
             data["share_features_extractor"] = self.share_features_extractor
         return data
 
 
 def _with_sparse_arguments(own: inspect.Signature) -> inspect.Signature:
-    """What ``help()`` shows: the fields of the config by name, before ``**kwargs``."""
+    """The signature with the fields of the config by name, before ``**kwargs``.
+
+    ``help()`` shows it, and :func:`arguments_of` reads it.
+    """
     *first, kwargs = own.parameters.values()
     sparse = [
         one.replace(kind=one.KEYWORD_ONLY)

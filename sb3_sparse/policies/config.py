@@ -10,6 +10,7 @@ import numpy as np
 import torch as th
 
 from sb3_sparse.engine.native.library import library
+from sb3_sparse.engine.optimizers import check_weight_decay
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.sparsity.budgets import split_sparsity
 from sb3_sparse.sparsity.distributions import check_distribution, check_sparsity
@@ -73,6 +74,7 @@ class SparsityConfig:
         if self.initial_sparsity is not None:
             check_sparsity(self.initial_sparsity, "initial_sparsity")
         check_distribution(self.distribution)
+        check_weight_decay(self.weight_decay, None)
         if not isinstance(self.dense_layers, (list, tuple)) or not all(
             isinstance(pattern, str) for pattern in self.dense_layers
         ):

@@ -15,6 +15,7 @@ from sb3_sparse.errors import MissingExtra
 from sb3_sparse.policies.actor_critic import SparseActorCriticPolicy
 from sb3_sparse.policies.base import BaseSparsePolicy
 from sb3_sparse.policies.critics import SparseCritic, SparseCriticsMixin
+from sb3_sparse.policies.dqn import value_passes
 from sb3_sparse.policies.fast_predict import Actions
 from sb3_sparse.policies.gaussian_actor import GaussianActor
 from sb3_sparse.policies.modules import ActingModule, PredictsByModule
@@ -24,7 +25,7 @@ from sb3_sparse.policies.registry import (
     variants_of,
 )
 from sb3_sparse.policies.sac import GAUSSIAN_ACTING, GAUSSIAN_ACTOR, TWIN_CRITIC, sac_passes
-from sb3_sparse.policies.spec import NetworkSpec, PassCounts, value_passes
+from sb3_sparse.policies.spec import NetworkSpec, PassCounts
 
 if find_spec("sb3_contrib") is None:
     raise MissingExtra("a sparse policy of TQC, QRDQN, CrossQ or TRPO", "contrib")
@@ -115,7 +116,7 @@ class SparseQRDQNPolicy(PredictsByModule, BaseSparsePolicy, QRDQNPolicy):
     }
 
     def make_quantile_net(self) -> SparseQuantileNetwork:
-        """As in sb3-contrib, of our own class."""
+        """As in sb3-contrib, but a :class:`SparseQuantileNetwork`."""
         kwargs = self._update_features_extractor(self.net_args, features_extractor=None)
         return SparseQuantileNetwork(**kwargs).to(self.device)
 
@@ -200,6 +201,6 @@ class SparseCrossQPolicy(SparseCriticsMixin, CrossQPolicy):
 (SparseCrossQMlpPolicy,) = variants_of(SparseCrossQPolicy, "Mlp")
 
 
-register_policy(TRPO, told_by="cg_max_steps")(SparseActorCriticPolicy)
+register_policy(TRPO, own_attribute="cg_max_steps")(SparseActorCriticPolicy)
 for _algorithm in (ARS, MaskablePPO, RecurrentPPO):
     reject(_algorithm)

@@ -58,7 +58,7 @@ class SparseCriticsMixin(PredictsByModule, BaseSparsePolicy):
     critic_kwargs: dict[str, Any]
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Any:
-        """As in SB3, but an :attr:`actor_class`."""
+        """As in SB3, with :attr:`actor_class`."""
         kwargs = self._update_features_extractor(self.actor_kwargs, features_extractor)
         return self.actor_class(**kwargs).to(self.device)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import torch as th
@@ -13,7 +14,7 @@ from sb3_sparse.policies.base import BaseSparsePolicy
 from sb3_sparse.policies.fast_predict import Actions
 from sb3_sparse.policies.modules import ActingModule, PredictsByModule
 from sb3_sparse.policies.registry import register_policy, variants_of
-from sb3_sparse.policies.spec import NetworkSpec, value_passes
+from sb3_sparse.policies.spec import NetworkSpec, PassCounts
 
 
 class SparseQNetwork(ActingModule, QNetwork):
@@ -30,6 +31,11 @@ class SparseQNetwork(ActingModule, QNetwork):
         """The best actions, shape ``(n,)``."""
         best: Actions = results[0].argmax(axis=1)
         return best
+
+
+def value_passes(network: str) -> Callable[[Any], list[PassCounts]]:
+    """The passes of a gradient step of DQN and QR-DQN."""
+    return lambda model: [PassCounts(network, 1, 1), PassCounts(network, 1, target=True)]
 
 
 @register_policy(DQN, passes=value_passes("q_net"))
@@ -57,7 +63,7 @@ class SparseDQNPolicy(PredictsByModule, BaseSparsePolicy, DQNPolicy):
     }
 
     def make_q_net(self) -> SparseQNetwork:
-        """As in SB3, of our own class."""
+        """As in SB3, but a :class:`SparseQNetwork`."""
         kwargs = self._update_features_extractor(self.net_args, features_extractor=None)
         return SparseQNetwork(**kwargs).to(self.device)
 

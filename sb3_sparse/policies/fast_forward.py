@@ -14,7 +14,8 @@ from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
 from torch import nn
 
-from sb3_sparse.engine.inference import MOST_INPUTS, Inference, KeptInference, by_modules
+from sb3_sparse.engine.inference import MOST_INPUTS, Inference, by_modules
+from sb3_sparse.engine.kept import KeptInference
 from sb3_sparse.engine.masked import MaskedStorage
 from sb3_sparse.engine.paths import Paths
 from sb3_sparse.policies.storage import is_known

@@ -78,7 +78,7 @@ class FastPredict(FastModeSwitch, BasePolicy):
         return super().unscale_action(scaled_action) if unscaled is None else unscaled
 
     def _in_box(self, actions: Actions, how: int) -> Actions | None:
-        """Actions moved by the kernels, see :meth:`Bounds.of`; None: NumPy has to compute them."""
+        """Actions clipped or scaled by the kernels, see :meth:`Bounds.of`; None: NumPy has to."""
         space, bounds = self.action_space, self._bounds
         if not isinstance(space, spaces.Box) or type(actions) is not np.ndarray:
             return None

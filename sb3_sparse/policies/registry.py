@@ -47,7 +47,7 @@ class Registration:
     algorithm: type[BaseAlgorithm]
     policy: type[BaseSparsePolicy]
     passes: CountPasses | None
-    told_by: str
+    own_attribute: str
 
     @property
     def stock_policy(self) -> type[BasePolicy]:
@@ -69,7 +69,7 @@ _rejected: list[type[BaseAlgorithm]] = []
 
 
 def register_policy(
-    algorithm: type[BaseAlgorithm], *, passes: CountPasses | None = None, told_by: str = ""
+    algorithm: type[BaseAlgorithm], *, passes: CountPasses | None = None, own_attribute: str = ""
 ) -> Callable[[type[Policy]], type[Policy]]:
     """Class decorator that makes a class the sparse policy of an algorithm.
 
@@ -82,8 +82,8 @@ def register_policy(
     :param passes: function of a model that counts the passes of one gradient step, for
         :func:`sb3_sparse.analysis.flops`; not needed if the algorithm inherits ``train()`` from a
         registered one
-    :param told_by: attribute of its models that models of other algorithms with the same policy
-        class lack; tells which algorithm saved a zip
+    :param own_attribute: attribute that, of the algorithms with this policy class, only this one's
+        models have; it tells which algorithm saved a zip
     :raises ConfigError: if another algorithm has that name already
     """
 
@@ -95,8 +95,8 @@ def register_policy(
                     f"the algorithm name {known!r} is taken by {_address(one.algorithm)}; give "
                     f"{_address(algorithm)} another"
                 )
-        _registered[name] = Registration(algorithm, policy, passes, told_by)
-        if "policy_aliases" not in vars(algorithm):  # but shares those of its base class
+        _registered[name] = Registration(algorithm, policy, passes, own_attribute)
+        if "policy_aliases" not in vars(algorithm):  # or it would change its base class's
             stock = {
                 n: c for n, c in algorithm.policy_aliases.items() if not n.startswith("Sparse")
             }
@@ -170,9 +170,11 @@ def algorithm_names() -> list[str]:
 
 def registered() -> dict[str, Registration]:
     """Every registration by the algorithm's class name, those of users last."""
-    for module in (*SB3.values(), *(("contrib",) if find_spec("sb3_contrib") else ())):
-        import_module(f"sb3_sparse.policies.{module}")
-    return {name: _registered[name] for name in algorithm_names()}
+    names = algorithm_names()
+    for name in names:
+        if name not in _registered:
+            import_module(f"sb3_sparse.policies.{SB3.get(name, 'contrib')}")
+    return {name: _registered[name] for name in names}
 
 
 def supported_algorithms() -> dict[str, type[BaseAlgorithm]]:
@@ -208,7 +210,7 @@ def sparse_counterpart(policy: BasePolicy) -> type[BaseSparsePolicy] | None:
     return None
 
 
-def writers_of(policy: type, attributes: Container[str] | None = None) -> list[str]:
+def possible_algorithms(policy: type, attributes: Container[str] | None = None) -> list[str]:
     """Class names of the algorithms that may have saved a model, the likeliest first.
 
     :param policy: class of the model's policy
@@ -222,6 +224,6 @@ def writers_of(policy: type, attributes: Container[str] | None = None) -> list[s
         if same:
             if attributes is None:
                 return same
-            told = [name for name in same if known[name].told_by in attributes]
-            return told or [name for name in same if not known[name].told_by]
+            told = [name for name in same if known[name].own_attribute in attributes]
+            return told or [name for name in same if not known[name].own_attribute]
     return []

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
-from typing import Any
 
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
@@ -21,17 +20,10 @@ class NetworkSpec:
 
     Example::
 
-        from sb3_sparse import NetworkSpec, SparseDQNPolicy
+        from sb3_sparse import SparseDQNPolicy
 
-        class MyPolicy(SparseDQNPolicy):
-            networks = {
-                "q_net": NetworkSpec(
-                    roots=("q_net",),
-                    trunks=("q_net.q_net",),
-                    heads=("q_net.q_net",),
-                    target="q_net_target",
-                )
-            }
+        spec = SparseDQNPolicy.networks["q_net"]
+        assert (spec.roots, spec.target) == (("q_net",), "q_net_target")
 
     :param roots: modules whose layers belong to the network; a layer that an earlier network has,
         such as one of a shared features extractor, stays with that one
@@ -81,11 +73,6 @@ def in_target(name: str, specs: Mapping[str, NetworkSpec]) -> bool:
     """Whether a dotted name lies in a target network."""
     targets = (f"{spec.target}." for spec in specs.values() if spec.target is not None)
     return name.startswith(tuple(targets))
-
-
-def value_passes(network: str) -> Callable[[Any], list[PassCounts]]:
-    """The passes of a gradient step of DQN and QR-DQN."""
-    return lambda model: [PassCounts(network, 1, 1), PassCounts(network, 1, target=True)]
 
 
 @dataclass

@@ -27,7 +27,7 @@ class SparseTD3Actor(ActingModule, Actor):
         return super().forward(obs) if results is None else results[0]
 
     def actions_from(self, results: list[Actions], deterministic: bool) -> Actions:
-        """What the network gives, shape ``(n, dim)``."""
+        """The output of the network, shape ``(n, dim)``."""
         return results[0]
 
 

@@ -50,7 +50,7 @@ class ModeSwitch:
         return False
 
     @property
-    def off(self) -> bool:
+    def in_evaluation_mode(self) -> bool:
         """Whether the modules that it last switched are in evaluation mode."""
         return self._changes is not None and not any(map(TRAINING, self._switched))
 
@@ -84,15 +84,15 @@ class FastModeSwitch(BaseModel):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        self._modes = ModeSwitch()
+        self._mode_switch = ModeSwitch()
 
     def set_training_mode(self, mode: bool) -> None:
         """As in SB3."""
         self._switch(mode)
 
     def _ensure_evaluation_mode(self) -> None:
-        """Switch to evaluation mode, where no module is called that would do it."""
-        if not self._modes.off:
+        """Switch to evaluation mode, as the bypassed methods of SB3 would."""
+        if not self._mode_switch.in_evaluation_mode:
             self._switch(False)
 
     def _switch(self, mode: bool) -> bool:
@@ -101,4 +101,4 @@ class FastModeSwitch(BaseModel):
         :param mode: True for training
         :return: whether the modules were the same as at the last switch
         """
-        return self._modes.switch(self, super().set_training_mode, mode)
+        return self._mode_switch.switch(self, super().set_training_mode, mode)

@@ -25,7 +25,7 @@ from sb3_sparse.loading.zooyaml import NotBuilt
 from sb3_sparse.policies.arguments import import_path
 from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.policies.internals import COUNTERS, LAST_SEEN, wrapped
-from sb3_sparse.policies.registry import writers_of
+from sb3_sparse.policies.registry import possible_algorithms
 from sb3_sparse.policies.saving import differ
 from sb3_sparse.sparsity.numeric import is_whole
 from sb3_sparse.zoo.arguments import Kind, kind_of
@@ -455,7 +455,7 @@ def algos_of(path: Path) -> list[str]:
     """
     data, _ = read_model(path)
     policy = data.get("policy_class")
-    found = writers_of(policy, data) if isinstance(policy, type) else []
+    found = possible_algorithms(policy, data) if isinstance(policy, type) else []
     if not found:
         named = policy.__name__ if isinstance(policy, type) else repr(policy)
         raise ConfigError(

@@ -21,7 +21,7 @@ def main() -> None:
         whole = tables._empty
         tables._empty = lambda count: whole(max(count - 24, 1))
     th.set_num_threads(2)
-    for name, compute in (("SAC", "sparse"), ("PPO", "masked")):
+    for name, compute in (("SAC", "sparse"), ("DQN", "masked"), ("PPO", "masked")):
         model = make(sb3_sparse, name, policy_kwargs=dict(sparsity=0.6, compute=compute))
         model.learn(60, callback=sb3_sparse.SparsityCallback("rigl", update_interval=4))
         assert model.why_not_fused() is None

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
 
 import sb3_sparse
-from sb3_sparse.algorithms.training import parts
 from sb3_sparse.engine.controller import Controller
 from sb3_sparse.fused.machine import Machine
 from sb3_sparse.fused.operations import Operation, in_phases
+from sb3_sparse.fused.parts import parts
 from sb3_sparse.fused.program import Program
 from sb3_sparse.fused.values import Value
 

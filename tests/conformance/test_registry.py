@@ -6,12 +6,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import stable_baselines3
 from support import ALGORITHMS, make
 
-from sb3_sparse.algorithms.table import algorithm_named
-from sb3_sparse.analysis import flops, gradient_snr
+from sb3_sparse import PassCounts, SparseDQNPolicy, SparseSACPolicy, register_policy
+from sb3_sparse.algorithms.table import algorithm_named, nearest
+from sb3_sparse.analysis import flops, gradient_snr, register_losses
+from sb3_sparse.analysis import losses as losses_module
+from sb3_sparse.analysis.flops import passes_of
+from sb3_sparse.analysis.losses import losses_for
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.export.extract import check_model, graph_of
+from sb3_sparse.policies import registry
 from sb3_sparse.policies.registry import CONTRIB, SB3, algorithm_names, registered
 from sb3_sparse.zoo.configs import METHODS, config_path, evaluation_of
 from sb3_sparse.zoo.saved import algos_of
@@ -87,3 +93,42 @@ def test_it_has_configs_and_a_place_in_the_documents(name):
         assert config_path(method, name.lower()).is_file()
     assert evaluation_of(name.lower(), "CartPole-v1", False)["eval_freq"] > 0
     assert name in (ROOT / "README.md").read_text()
+
+
+class InheritingSAC(stable_baselines3.SAC):
+    """SAC with the train() of its base class."""
+
+
+def test_what_is_registered_for_a_subclass_is_not_its_base_classes(monkeypatch):
+    monkeypatch.setattr(registry, "_registered", dict(registry.registered()))
+    monkeypatch.setattr(losses_module, "_losses", dict(losses_module._losses))
+    before = losses_for(stable_baselines3.SAC)
+    assert losses_for(InheritingSAC) is before
+    counts = [PassCounts("actor", 7, 7)]
+
+    @register_policy(InheritingSAC, passes=lambda model: counts)
+    class Policy(SparseSACPolicy):
+        """SAC's, under another name."""
+
+    @register_losses(InheritingSAC)
+    def losses(model, policy, batch):
+        return []
+
+    assert losses_for(InheritingSAC) is losses
+    assert losses_for(stable_baselines3.SAC) is before
+    assert nearest(InheritingSAC, {stable_baselines3.SAC: 1}) == 1
+    model = InheritingSAC(Policy, "Pendulum-v1", policy_kwargs=dict(sparsity=0.5))
+    assert passes_of(model) == counts
+
+
+def test_a_policy_may_give_the_sparse_arguments_itself():
+    class Narrow(SparseDQNPolicy):
+        """Has one argument of its own."""
+
+        def __init__(self, observation_space, action_space, lr_schedule, width=16):
+            super().__init__(
+                observation_space, action_space, lr_schedule, sparsity=0.5, net_arch=[width]
+            )
+
+    model = stable_baselines3.DQN(Narrow, "CartPole-v1", policy_kwargs=dict(width=8))
+    assert model.policy.sparsity_report().layers[0].shape == (8, 4)

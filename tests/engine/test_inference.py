@@ -16,7 +16,8 @@ from torch import nn
 
 from sb3_sparse.engine.activations import ACTIVATIONS
 from sb3_sparse.engine.gaussian import sample_gaussian, sample_squashed
-from sb3_sparse.engine.inference import Inference, KeptInference
+from sb3_sparse.engine.inference import Inference
+from sb3_sparse.engine.kept import KeptInference
 from sb3_sparse.engine.linear import SparseLinear
 from sb3_sparse.engine.masked import MaskedStorage
 from sb3_sparse.engine.native import library

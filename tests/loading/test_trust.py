@@ -159,7 +159,7 @@ NARROW = {
         ("DQN", "TinyImages-v0", NARROW),
     ],
 )
-def test_what_is_told_by_names_and_shapes_is_the_policys_own_report(
+def test_what_is_own_attribute_names_and_shapes_is_the_policys_own_report(
     algorithm, env, kwargs, tmp_path
 ):
     discrete = algorithm in ("DQN", "PPO")

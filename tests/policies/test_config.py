@@ -21,13 +21,14 @@ from sb3_sparse.policies.config import SparsityConfig
         (dict(sparsity={"actor": 0.5, "critic": 2}), "sparsity of 'critic' must lie"),
         (
             dict(sparsity={"actor": 0.5, "critic": 0.5}, actor_share=0.5),
-            "sparsity is given",
+            "actor_share divides one sparsity",
         ),
         (dict(sparsity=0.9, initial_sparsity=1.5), "initial_sparsity must lie"),
         (dict(sparsity=0.9, distribution="flat"), "'flat'; allowed are er, erk, uniform"),
         (dict(sparsity=0.9, dense_layers="output"), r"must be a list of names.*got 'output'"),
         (dict(sparsity=0.9, sparsity_aware_init="yes"), "true or false, got 'yes'"),
         (dict(sparsity=0.9, mask_seed=-1), "0 or more, got -1"),
+        (dict(sparsity=0.9, weight_decay=-3.0), "weight_decay must be 0 or more, got -3.0"),
     ],
 )
 def test_values_that_are_not_allowed_are_named_with_what_is(wrong, message):

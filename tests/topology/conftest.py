@@ -69,7 +69,7 @@ def make_layer():
 
 @pytest.fixture(scope="session")
 def make_update():
-    """Maker of moments, at the start of training unless said otherwise."""
+    """Maker of mask updates, at the start of training unless said otherwise."""
 
     def make(progress=0.0, drop_fraction=0.5, step=1000, begin=0.0, end=0.8, seed=0):
         return MaskUpdate(

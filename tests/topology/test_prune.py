@@ -20,7 +20,7 @@ def dense_layer(make_layer):
 
 @pytest.fixture
 def at(make_update):
-    """MaskUpdate of a progress on the ramp from 0.2 to 0.8."""
+    """The mask update at a progress on the ramp from 0.2 to 0.8."""
     return lambda progress: make_update(progress=progress, begin=0.2, end=0.8, drop_fraction=0.0)
 
 

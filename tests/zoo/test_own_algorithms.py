@@ -14,7 +14,7 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 from sb3_sparse import SAC, SparseSACPolicy, register_policy, sparsify
 from sb3_sparse.analysis import Loss, flops, gradient_snr, register_losses
-from sb3_sparse.analysis.losses import _losses
+from sb3_sparse.analysis.losses import _losses, losses_for
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.export import export_policy
 from sb3_sparse.policies import registry
@@ -110,6 +110,7 @@ def test_its_snr_is_measured_once_it_has_losses(folder):
         samples = dict(observations=batch.observations, actions=batch.actions)
         return [Loss(("actor",), samples, of_actor), Loss(("critic",), samples, of_critic)]
 
+    assert losses_for(stable_baselines3.SAC) is not losses
     try:
         assert gradient_snr(model, batch)["actor"].active > 0
     finally:

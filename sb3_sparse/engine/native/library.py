@@ -57,7 +57,7 @@ _SIGNATURES: dict[str, tuple[Any, list[Any]]] = {
     "box": (None, [_INT, _LONG, _LONG, *(_ADDRESS,) * 4]),
     "squashed": (_INT, [_LONG, _DOUBLE, _DOUBLE, *(_ADDRESS,) * 4]),
 }
-"""Type of the result and of the arguments of each function of the library."""
+"""Types of the result and the arguments of the functions that take plain numbers and addresses."""
 
 
 @cache
