@@ -81,4 +81,4 @@ def _is_command_line() -> bool:
 
 
 if not _is_command_line():
-    registered()
+    registered()  # imports the policies, which register themselves

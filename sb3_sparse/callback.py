@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
-
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_sparse.engine.plan import Plan
@@ -37,8 +35,8 @@ class SparsityCallback(BaseCallback):
     :param update_interval: gradient steps of a network's own optimizer between two updates
     :param drop_fraction: share of a layer's connections exchanged at the first update; decays to 0
         along a cosine
-    :param begin: progress (environment steps done / planned) at which updates begin; None: as the
-        method has it, which is 0.2 for ``"prune"`` and 0 for the others
+    :param begin: progress (environment steps done / planned) at which updates begin; None: the
+        method's default, 0.2 for ``"prune"`` and 0 for the others
     :param end: progress at which they end
     :param update_on: ``"step"``: at the gradient step that is due; ``"rollout"``: at the start of
         the next rollout
@@ -69,8 +67,8 @@ class SparsityCallback(BaseCallback):
             "end": end,
             "update_on": update_on,
         }
-        usual = inspect.signature(SparsityCallback).parameters
-        changed = {name for name, value in given.items() if value != usual[name].default}
+        usual = SparsityCallback.__init__.__kwdefaults__ or {}
+        changed = {name for name, value in given.items() if value != usual[name]}
         unused = sorted(changed - topology.options)
         if unused:
             raise ConfigError(

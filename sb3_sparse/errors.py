@@ -33,7 +33,7 @@ def check_choice(what: str, name: object, allowed: Collection[str], hint: str = 
     :param what: kind of thing that has the name, e.g. ``"launcher"``
     :param name: the name, of any type
     :param allowed: all names, in the order to show them in
-    :param hint: what else the message shall say
+    :param hint: further text for the message
     :raises ConfigError: if the name is unknown
     """
     if not isinstance(name, str) or name not in allowed:

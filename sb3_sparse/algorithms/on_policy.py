@@ -121,9 +121,9 @@ class OnPolicy(Fused, OnPolicyAlgorithm):
         return centred / (variance.sqrt() + 1e-8)
 
     def _minibatches(self, size: int | None) -> Iterator[Minibatch]:
-        """The rollout in parts, of the same random numbers as SB3.
+        """Split the rollout into minibatches by the same random numbers as SB3.
 
-        :param size: of a part; None: the whole rollout
+        :param size: size of a minibatch; None: the whole rollout
         """
         buffer: Any = self.rollout_buffer
         total = buffer.buffer_size * buffer.n_envs
@@ -159,7 +159,7 @@ class OnPolicy(Fused, OnPolicyAlgorithm):
         )
 
     def _raise_error(self, part: Minibatch, check: str) -> None:
-        """Let SB3's distribution raise its error, for means that are not finite say."""
+        """Let SB3's distribution raise its error, e.g. for means that are not finite."""
         data, buffer = part.data, self.rollout_buffer
         if data is None:
             data = samples(buffer, part.rows)

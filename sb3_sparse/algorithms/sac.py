@@ -116,7 +116,7 @@ class SAC(OffPolicy, stable_baselines3.SAC):
         self._log_round(logged)
 
     def _raise_error(self, machine: Machine, data: Any, noise: str) -> None:
-        """Let SB3's distribution raise its error, for means that are not finite say."""
+        """Let SB3's distribution raise its error, e.g. for means that are not finite."""
         obs = self._observations(machine, data, next_ones=noise == "next_noise")
         with th.no_grad(), th.random.fork_rng(devices=[]):
             self.actor.action_log_prob(obs)

@@ -216,7 +216,7 @@ class Fused(BaseAlgorithm):
             self.policy.use_kernels()  # also at sparsity 0, where the policy would stay SB3's
 
     def _check_policy_class(self) -> None:
-        """Reject policies of other algorithms, of a file that another one saved, say.
+        """Reject a policy of another algorithm, e.g. from a file that it saved.
 
         :raises UnsupportedError: for a policy class that is known to be of another algorithm
         """

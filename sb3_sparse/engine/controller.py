@@ -97,7 +97,7 @@ class Controller:
     def _hook_gradients(self) -> list[RemovableHandle]:
         functional = self.functional_gradients
         for layer in self.layers:
-            layer.gradient = None
+            layer.gradient_mask = None
         return [
             layer.hook_gradient(functional, partial(self._capturing, network))
             for network in self.networks
@@ -166,8 +166,8 @@ class Controller:
         if not self._in_force():
             self.plan = None  # left from an interrupted training
         for layer in _sparse_layers(self.networks):
-            if layer.gradient is not None:
-                layer.gradient.dense_grad = None
+            if layer.gradient_mask is not None:
+                layer.gradient_mask.dense_grad = None
             layer.remask()
             layer.settle_targets(self.soft_targets)
 

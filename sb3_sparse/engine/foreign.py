@@ -1,4 +1,4 @@
-"""Support for the user's own optimizers on a policy's weights, for behaviour cloning say.
+"""Support for the user's own optimizers on a policy's weights, e.g. for behaviour cloning.
 
 Their steps do not advance the policy's clocks. But their moments of a weight must follow its mask,
 and what they write to inactive connections must be removed. Torch's hooks on the steps of all

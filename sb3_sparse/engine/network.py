@@ -161,7 +161,7 @@ class SparseNetwork:
 
     def take_gradients(self) -> dict[str, DenseGradient | None]:
         """Take the dense gradients of the next step, by layer name."""
-        hooked = ((layer.name, layer.gradient) for layer in self.layers)
+        hooked = ((layer.name, layer.gradient_mask) for layer in self.layers)
         return {name: gradient.take() for name, gradient in hooked if gradient is not None}
 
     def move(

@@ -52,9 +52,9 @@ def prefer_fused(optimizer: th.optim.Optimizer) -> None:
 def acts_elementwise(optimizer: th.optim.Optimizer) -> bool:
     """Whether the optimizer moves active weights alike with and without inactive ones.
 
-    This is tried out: three steps of a copy on a 4x6 matrix with zeros, and on its other entries as
-    a vector. Adam, SGD and RMSprop pass. Adafactor and Muon, whose steps depend on rows and
-    columns, optimizers that add noise and those that fail on such weights do not.
+    It is found by trial: a copy takes three steps on a 4x6 matrix with zeros, and on its other
+    entries as a vector. Adam, SGD and RMSprop pass. Adafactor and Muon, whose steps depend on rows
+    and columns, optimizers that add noise and those that fail on such weights do not.
     """
     active = th.arange(24).view(4, 6) % 3 > 0
     start = th.linspace(-1.0, 1.0, 24).view(4, 6) * active

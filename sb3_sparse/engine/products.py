@@ -43,12 +43,12 @@ def tiles_of(batch: int) -> int:
 class ChainPass(NamedTuple):
     """One forward pass of a batch through a chain, and the backward pass if there is one.
 
-    :param activations: what follows each layer
+    :param activations: activation after each layer; None: there is none
     :param structures: connections of each layer
     :param layers: weak references to the layers
     :param batch: entries of the batch
     :param tiled_in: whether the input comes in tiles
-    :param tiled_out: whether the result shall be in tiles
+    :param tiled_out: whether the result is in tiles
     """
 
     activations: list[nn.Module | None]
@@ -130,12 +130,12 @@ class ChainPass(NamedTuple):
         grad: th.Tensor,
         arguments: Any,
     ) -> list[th.Tensor | None]:
-        """Gradients of the input and of each parameter; None where not needed.
+        """Compute the gradients of the input and of each parameter; None where not needed.
 
         :param work: activations as :meth:`forward` left them
         :param needs: whether the gradient of the input and of each parameter is needed
-        :param grad: of the result
-        :param arguments: an array of ``layer_t`` of its own, to be filled in
+        :param grad: gradient of the result
+        :param arguments: a copy of the array of ``layer_t``; this sets its gradient addresses
         """
         needs_x, *needed = needs
         grads = [

@@ -29,7 +29,7 @@ def find_prunable(
     :param root: module to search
     :param prefix: dotted name of ``root``
     :param stays_dense: whether the user wants the layer of that name dense
-    :raises UnsupportedError: for a layer whose weights cannot be masked and shall not stay dense
+    :raises UnsupportedError: for a layer whose weights cannot be masked, unless it stays dense
     """
     for name, module in root.named_modules(prefix=prefix):
         if isinstance(module, UNSUPPORTED_TYPES) and not stays_dense(name):

@@ -42,7 +42,7 @@ class LayerStorage(ABC):
         self.final_nnz = self.size
         self.moments_stale = False
         """Whether an optimizer's moments may not fit the mask."""
-        self.gradient: GradientMask | None = None
+        self.gradient_mask: GradientMask | None = None
         """The hook on the weight's gradient; None if there is none, as for frozen weights."""
 
     def __getstate__(self) -> dict[str, Any]:
@@ -155,16 +155,16 @@ class LayerStorage(ABC):
         :param functional: whether the algorithm uses ``torch.autograd.grad``
         :param capturing: tells whether the next step needs the dense gradient
         """
-        self.gradient = self._gradient_mask(functional, capturing)
-        return self.gradient.attach()
+        self.gradient_mask = self._gradient_mask(functional, capturing)
+        return self.gradient_mask.attach()
 
     @abstractmethod
     def _gradient_mask(self, functional: bool, capturing: Callable[[], bool]) -> GradientMask: ...
 
     def note_gradient(self, dense_grad: th.Tensor) -> None:
         """Take the dense gradient of the next step from whatever has computed it."""
-        if self.gradient is not None:
-            self.gradient.dense_grad = lambda: dense_grad
+        if self.gradient_mask is not None:
+            self.gradient_mask.dense_grad = lambda: dense_grad
 
     @abstractmethod
     def settle_moments(self, optimizers: Sequence[th.optim.Optimizer]) -> None:

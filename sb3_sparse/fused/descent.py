@@ -27,7 +27,7 @@ class Descent:
         self._layers: list[int] = []
 
     def record(self, loss: Value, clip: Value | None) -> None:
-        """Record everything.
+        """Record the gradients, their clipping and the step.
 
         :param loss: a single number
         :param clip: maximum norm of the gradient; None: no clipping

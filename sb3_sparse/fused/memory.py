@@ -85,7 +85,7 @@ class _Pool:
         return self.size - size
 
     def give(self, size: int, at: int) -> None:
-        """Free numbers."""
+        """Return memory to the pool."""
         self._free[size].append(at)
 
 

@@ -30,8 +30,8 @@ class Operation:
     :param number: number of a layer, parameter, input or activation
     :param p: first parameter of an activation, or a factor
     :param q: second parameter of an activation
-    :param reads: other things that must exist before
-    :param writes: other things that exist afterwards
+    :param reads: keys that earlier operations must have written
+    :param writes: keys that later operations may read
     :param tiled: whether it runs on each tile
     :param changes: whether it changes parameters, which all later operations must see
     """

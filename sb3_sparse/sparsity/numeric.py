@@ -1,4 +1,4 @@
-"""Tell numbers among arguments: Python's and NumPy's count, booleans do not."""
+"""Checks of numeric arguments: Python's and NumPy's numbers count, booleans do not."""
 
 from __future__ import annotations
 

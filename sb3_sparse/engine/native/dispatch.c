@@ -128,7 +128,7 @@ EXPORT int64_t sb3_sparse_fused(const program_t *program, int64_t first, int64_t
     return chosen->fused(program, first, last);
 }
 
-/* Sets to 0 what the mask has inactive; what is no number stays so, lest nobody notices. */
+/* Sets inactive weights to 0, except NaN and infinities, which become NaN and stay visible. */
 EXPORT void sb3_sparse_clear(float *weight, const float *mask, int64_t count) {
     for (int64_t i = 0; i < count; i++) weight[i] *= mask[i];
 }

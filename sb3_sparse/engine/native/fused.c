@@ -358,7 +358,7 @@ static int has_nan(const program_t *program, const operation_t *o) {
 static double sum_of_squares(const float *x, int64_t count) {
     double sum = 0;
     int64_t k = 0;
-    while (k + WIDTH <= count) { /* in parts, which keeps small ones */
+    while (k + WIDTH <= count) { /* in parts, so that small terms are not lost */
         vec part = {0};
         for (int64_t end = k + 64 * WIDTH; k < end && k + WIDTH <= count; k += WIDTH)
             part += LOAD(x + k) * LOAD(x + k);
