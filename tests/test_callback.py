@@ -117,8 +117,8 @@ def test_trpos_actor_grows_by_the_gradient_of_its_objective(gradient_spy):
                 layer.weight._backward_hooks = hooks
             objective.setdefault(layer.name, []).append(grad.numpy().ravel().copy())
         for layer in model.policy.sparse.layers:
-            if layer.gradient is not None:
-                layer.gradient.dense_grad = None
+            if layer.gradient_mask is not None:
+                layer.gradient_mask.dense_grad = None
         return compute(kl_div, policy_objective)
 
     model._compute_actor_grad = spied

@@ -46,7 +46,7 @@ class LayerStorage(ABC):
         """The hook on the weight's gradient; None if there is none, as for frozen weights."""
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "gradient": None}  # hooks are registered anew on a copy
+        return {**self.__dict__, "gradient_mask": None}  # hooks are registered anew on a copy
 
     @property
     def weight(self) -> nn.Parameter:
