@@ -234,7 +234,7 @@ def test_inspect_of_what_is_no_model(tmp_path, mistake):
     (tmp_path / "notes.zip").write_text("no zip at all")
     for name, message in (
         ("gone.zip", "there is no file"),
-        ("notes.zip", "holds no model saved"),
+        ("notes.zip", "is damaged, or holds no model saved by SB3"),
     ):
         assert message in mistake("inspect", name)
 

@@ -253,7 +253,8 @@ def test_normalised_and_stacked_dicts(tmp_path):
     expected, _ = model.predict(normalised.normalize_obs(raw), deterministic=True)
     np.testing.assert_allclose(policy(raw), expected, atol=1e-5)
     other = VecNormalize(DummyVecEnv([lambda: Task(dicts(1), TORQUE)]))
-    with pytest.raises(ConfigError, match=r"shape \(7,\).*but those here have shape"):
+    wrong = r"shape \(7,\), but those here have shape \(7,\), \(2,\)"
+    with pytest.raises(ConfigError, match=wrong):
         export_policy(model, tmp_path / "other", "c", vecnormalize=other)
     stacked = VecFrameStack(VecNormalize(DummyVecEnv([lambda: Task(space, TORQUE)])), 3)
     model = make("PPO", stacked)

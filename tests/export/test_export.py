@@ -284,7 +284,7 @@ def test_a_model_that_saw_normalised_observations_needs_the_statistics(tmp_path)
     envs.save(str(tmp_path / "statistics.pkl"))
     trained.save(tmp_path / "model.zip")
     alone = type(trained).load(tmp_path / "model.zip")
-    with pytest.raises(ConfigError, match="VecNormalize.*--vecnormalize FILE"):
+    with pytest.raises(ConfigError, match="under a VecNormalize.*--vecnormalize FILE"):
         export_policy(alone, tmp_path / "policy")
     report = export_policy(alone, tmp_path / "policy", vecnormalize=tmp_path / "statistics.pkl")
     assert report.parity.holds

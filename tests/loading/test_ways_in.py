@@ -99,7 +99,7 @@ def test_statistics_that_the_config_denies_are_not_passed_over(folder, mistake):
         .replace("normalize: true", "normalize: false")
         .replace("- - normalize\n    - true", "- - normalize\n    - false")
     )
-    assert "nothing was normalised" in mistake("enjoy", str(folder))
+    assert "config.yml nothing was normalised" in mistake("enjoy", str(folder))
 
 
 def test_statistics_beside_a_lone_zip_are_not_passed_over(tmp_path):

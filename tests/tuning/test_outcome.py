@@ -214,7 +214,7 @@ def test_what_optuna_says_of_a_figure_stands_below_it(storage, tmp_path):
     [
         (
             ["nope"],
-            "there is no search 'nope' in .*journal.log; its searches are foreign, mine",
+            "there is no search 'nope' in .*journal.log; its searches are foreign, mine, new",
         ),
         (["foreign"], "'foreign' in .* was not made by sb3-sparse tune; look at it with optuna-d"),
         (["new"], "no trial of 'new' was completed yet, so there is nothing to report"),
