@@ -23,10 +23,11 @@ def write_best(search: Search, path: Path) -> Path:
 
     :raises ConfigError: if no trial was completed
     """
-    text = as_yaml({search.definition.run.env_id: search.best_settings()})
+    settings, origin = search.best_entry()
+    text = as_yaml({search.definition.run.env_id: settings})
     path.parent.mkdir(parents=True, exist_ok=True)
     with written_whole(path) as new:
-        new.write_text(f"# {TUNED}: {search.describe_best()}\n{text}", encoding="utf-8")
+        new.write_text(f"# {TUNED}: {origin}\n{text}", encoding="utf-8")
     return path
 
 
@@ -55,9 +56,10 @@ def merge_best(search: Search, path: Path) -> None:
     :raises ConfigError: if no trial was completed, if the file is for another method, or if the
         change would change other entries; the file then stays as it was
     """
-    run, settings = search.definition.run, search.best_settings()
+    run = search.definition.run
+    settings, origin = search.best_entry()
     check_target(run, path)
-    comment = f"{TUNED}: {search.describe_best()}"
+    comment = f"{TUNED}: {origin}"
     text = merge_entry(_read(path), run.env_id, settings, comment, TUNED, str(path))
     with written_whole(path) as new:
         new.write_text(text, newline="", encoding="utf-8")

@@ -134,29 +134,20 @@ class Search:
             failed=tuple(t for t in by_ticket.values() if t.state == TrialState.FAIL),
         )
 
-    def best(self) -> FrozenTrial:
-        """Return the best trial so far.
+    def best_entry(self) -> tuple[dict[str, Any], str]:
+        """Return the settings of the tuned run with the best values, and where these come from.
 
+        :return: the settings, and a line with search, trial, number of trials, score and date
         :raises ConfigError: if no trial was completed
         """
-        best = self.status().best
+        status, seeds = self.status(), self.definition.seeds
+        best = status.best
         if best is None:
             raise ConfigError(f"no trial of {self.name!r} was completed yet; let it continue")
-        return best
-
-    def best_settings(self) -> dict[str, Any]:
-        """Return the settings of the tuned run with the best values so far.
-
-        :raises ConfigError: if no trial was completed
-        """
-        return with_values(self.definition.run, self.best().user_attrs[VALUES]).settings().as_dict()
-
-    def describe_best(self) -> str:
-        """Return where the best values come from: search, number of trials, score and date."""
-        status, best, seeds = self.status(), self.best(), self.definition.seeds
+        settings = with_values(self.definition.run, best.user_attrs[VALUES]).settings()
         mean = f", mean of {seeds} seeds" if seeds > 1 else ""
         finished = [t.datetime_complete for t in status.done if t.datetime_complete is not None]
-        return (
+        return settings.as_dict(), (
             f"search {self.name}, trial {best.number} of {len(status.done)} trials, "
             f"score {best.values[0]:.6g}{mean}, {max(finished).date()}"
         )

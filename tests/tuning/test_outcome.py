@@ -78,7 +78,7 @@ def test_the_best_values_are_a_config_that_trains_as_it_is(study, tmp_path):
     content = yaml.safe_load(path.read_text())
     assert content.keys() == {"CartPole-v1"}
     entry = content["CartPole-v1"]
-    assert entry == Search(study).best_settings()
+    assert entry == Search(study).best_entry()[0]
     assert entry["policy_kwargs"]["weight_decay"] == 1e-6
     assert "compute" not in entry["policy_kwargs"]  # a choice of tuning's
     assert entry["callback"][0]["sb3_sparse.SparsityCallback"]["update_interval"] == 100
@@ -97,7 +97,7 @@ def test_the_best_values_go_into_one_entry_of_a_config(storage, tmp_path):
     path.write_text(text)
     merge_best(Search(study), path)
     before, after = yaml.safe_load(text), yaml.safe_load(path.read_text())
-    assert after["Acrobot-v1"] == Search(study).best_settings()
+    assert after["Acrobot-v1"] == Search(study).best_entry()[0]
     assert {**after, "Acrobot-v1": None} == {**before, "Acrobot-v1": None}
     lines = iter(path.read_text().splitlines())
     assert all(line in lines for line in text.splitlines())  # all are there, in their order
@@ -114,11 +114,11 @@ def test_a_study_whose_config_has_taken_the_best_values_is_still_the_same(storag
     path = config_of_ones_own(tmp_path)
     run = small_run(env_id="Acrobot-v1", conf_file=str(path))
     study = finished(storage, "mine", decay_matters, run)
-    best = Search(study).best_settings()
+    best = Search(study).best_entry()[0]
     merge_best(Search(study), path)
     again = finished(storage, "mine", decay_matters, run)
     assert len(again.get_trials()) == 6
-    assert Search(again).best_settings() == best
+    assert Search(again).best_entry()[0] == best
     path.write_text(path.read_text().replace("gamma: 0.99", "gamma: 0.9"))
     with pytest.raises(ConfigError, match="settings.gamma is 0.99 there and 0.9 now"):
         finished(storage, "mine", decay_matters, run)
@@ -129,7 +129,7 @@ def test_a_study_needs_its_config_no_more(storage, study, tmp_path):
     other = finished(storage, "other", decay_matters, small_run(conf_file=str(path)))
     path.unlink()
     assert "<h2>mine</h2>" in report_by_name(["mine"], None, tmp_path, None).read_text()
-    assert Search(other).best_settings()["gamma"] == 0.99
+    assert Search(other).best_entry()[0]["gamma"] == 0.99
 
 
 def test_a_study_that_cannot_be_read_here_is_named_and_spoils_no_page(storage, study, tmp_path):
