@@ -133,8 +133,7 @@ def status(
         if one.state is CellState.DIVERGED:
             say(f"diverged: {one.cell.name}, at step {one.steps}")
         if one.state is CellState.FAILED:
-            why = one.reason or f"see {one.cell.errors(store)}"
-            say(f"failed: {one.cell.name}; {why}")
+            say(f"failed: {one.cell.name}; {one.why(store)}")
 
 
 @studies.command()
@@ -190,8 +189,9 @@ def _check_figures(study: Study) -> None:
 
 
 def _pending(one: CellStatus, store: Path) -> str:
-    why = one.reason or f"see {one.cell.errors(store)}"
-    failed = f": failed, {why}" if one.state == "failed" else ""
+    from sb3_sparse.studies.status import CellState
+
+    failed = f": failed, {one.why(store)}" if one.state is CellState.FAILED else ""
     return f"{one.cell.name}{failed}"
 
 

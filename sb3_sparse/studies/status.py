@@ -66,6 +66,13 @@ class CellStatus:
     reason: str | None = None
     archived: Archived | None = None
 
+    def why(self, store: Path) -> str:
+        """Return why the cell failed, or where that is written.
+
+        :param store: folder of the studies' runs
+        """
+        return self.reason or f"see {self.cell.errors(store)}"
+
 
 def status_of(cell: Cell, store: Path, lines: Lines | None = None) -> CellStatus:
     """Return the status of a cell. Its line in the archive takes precedence over its folder.
