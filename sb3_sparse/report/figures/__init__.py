@@ -1,10 +1,10 @@
 """The figures, one per file; importing this package registers them all."""
 
 from sb3_sparse.report.figures import (  # noqa: F401
-    aggregate,
     curves,
     flops,
     improvement,
+    iqm,
     masks,
     noise,
     parameters,
