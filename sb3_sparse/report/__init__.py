@@ -1,7 +1,8 @@
 """Reports on runs: figures, tables and verdicts, read from run folders."""
 
-from sb3_sparse.report.data import LeftOut, RunData, read_runs
+from sb3_sparse.report.data import LeftOut, RunData
 from sb3_sparse.report.figures import FIGURES
+from sb3_sparse.report.reading import read_runs
 from sb3_sparse.report.results import Results
 from sb3_sparse.report.verdicts import FINDINGS, Verdict, judge
 from sb3_sparse.report.write import write_report

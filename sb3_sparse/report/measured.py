@@ -14,11 +14,17 @@ from sb3_sparse.loading.text import read_text
 
 Rows = tuple[dict[str, str], ...]
 Points = list[tuple[float, float]]
-SNR, NOISE = "snr.csv", "robustness.csv"
+SNR, PLASTICITY, NOISE = "snr.csv", "plasticity.csv", "robustness.csv"
 OF_SNR = "snr/"  # begins the names of its series
 TEXT = "name"
+MEASURED = {
+    SNR: ("timesteps", TEXT, "value"),
+    PLASTICITY: ("timesteps", TEXT, "value"),
+    NOISE: ("sigma", "seed", "episode", "return"),
+}
+"""Columns of each file of measurements."""
 WHAT = "file of measurements"
-CURE = "remove it, or measure anew"
+CURE = "remove it, or measure again"
 
 
 def measured_text(path: Path) -> str:

@@ -7,9 +7,9 @@ from pathlib import Path
 
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.files import write_csv, written_whole
-from sb3_sparse.report.data import read_runs
 from sb3_sparse.report.figures import NotEnoughData, check_figures, draw, save
 from sb3_sparse.report.page import CSV_FILES, Content, Shown, render
+from sb3_sparse.report.reading import read_runs
 from sb3_sparse.report.results import Results
 from sb3_sparse.report.tables import cells_table, runs_table, verdicts_table
 from sb3_sparse.report.verdicts import judge

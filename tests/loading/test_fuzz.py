@@ -13,7 +13,7 @@ import pytest
 import yaml
 
 from sb3_sparse import cli
-from sb3_sparse.report.data import read_runs
+from sb3_sparse.report.reading import read_runs
 from sb3_sparse.zoo.spec import RunSpec
 from sb3_sparse.zoo.training import train
 
