@@ -69,7 +69,9 @@ ConfFile = Annotated[
 ]
 EvalFreq = Annotated[int | None, option("Steps between two evaluations.", shown="as the paper")]
 EvalEpisodes = Annotated[int | None, option("Episodes of an evaluation.", shown="as the paper")]
-Best = Annotated[bool, option("Of a run's folder, the best policy instead of the last.", "--best")]
+Best = Annotated[
+    bool, option("Take the best policy of a run's folder instead of the last.", "--best")
+]
 ModelAlgo = Annotated[str | None, option("Algorithm.", shown="as the run or the file")]
 ModelEnv = Annotated[
     str | None, option("Gymnasium environment id, or package:Id.", shown="as the run")
@@ -80,7 +82,7 @@ Statistics = Annotated[
 ]
 Launcher = Annotated[str, option("local: processes of this machine; ray: a Ray cluster.")]
 Address = Annotated[
-    str | None, option("Of the Ray cluster, e.g. auto.", shown="one of this machine")
+    str | None, option("Address of the Ray cluster, e.g. auto.", shown="one of this machine")
 ]
 Device = Annotated[str, option("auto, cpu or cuda.")]
 LogFolder = Annotated[Path, option("Where folders are made.", "--log-folder", "-f")]

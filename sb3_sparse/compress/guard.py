@@ -60,7 +60,7 @@ def change(sparse: Sequence[float], baseline: Sequence[float]) -> Interval:
 
 
 def judge(change: Interval, tolerance: float) -> Literal["passed", "failed", "undecided"]:
-    """Tell whether a drop is tolerable (passed), intolerable (failed), or could be either.
+    """Judge a drop: tolerable (passed), intolerable (failed) or undecided.
 
     :param change: change of the mean return
     :param tolerance: largest drop allowed, in units of the return, 0 or more

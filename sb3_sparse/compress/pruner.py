@@ -1,4 +1,4 @@
-"""The models, environments and files of a search."""
+"""Prunes, fine-tunes, evaluates and saves models for a search."""
 
 from __future__ import annotations
 

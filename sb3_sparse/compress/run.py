@@ -112,7 +112,7 @@ def _finish(
     name: str,
     say: Callable[[str], None],
 ) -> None:
-    """Do what a compression still lacks, and write the final files."""
+    """Complete a compression, and write the final files."""
 
     def save() -> None:
         record.save(pruner.folder)

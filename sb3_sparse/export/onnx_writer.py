@@ -1,4 +1,4 @@
-"""What ONNX models are made of: nodes, constants, and activations, all of opset 17."""
+"""Collects the nodes and constants of an ONNX model, activations included (opset 17)."""
 
 from __future__ import annotations
 

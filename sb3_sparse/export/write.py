@@ -40,7 +40,7 @@ RANDOM_IMAGES = 100
 
 @dataclass(frozen=True)
 class ExportReport:
-    """What was written.
+    """The outcome of an export.
 
     :param files: the files and their sizes in bytes
     :param parity: how closely the export acts as the model; None: not checked

@@ -38,7 +38,7 @@ class Job:
 
 @dataclass(frozen=True)
 class Plan:
-    """What the process that forks is told to do.
+    """The jobs of the process that forks.
 
     :param path: where modules are found
     :param modules: modules to import before the first task begins

@@ -1,1 +1,1 @@
-"""HTML pages that need nothing but themselves, and tables for pages and CSV files."""
+"""Self-contained HTML pages, and tables for pages and CSV files."""

@@ -1,4 +1,4 @@
-"""The HTML of a page that needs nothing but itself: text, sortable tables, figures, style."""
+"""Builds self-contained HTML pages: text, sortable tables, figures, style."""
 
 from __future__ import annotations
 

@@ -38,7 +38,7 @@ def measured_text(path: Path) -> str:
 def rows_of(text: str, path: Path, columns: Sequence[str]) -> Rows:
     """Parse the rows of a CSV text that has at least these columns.
 
-    :param path: of the text's file, for messages
+    :param path: path of the text's file, for messages
     :raises ConfigError: if a column is missing, or a cell is not a number
     :raises CorruptStateError: if it is not a table
     """

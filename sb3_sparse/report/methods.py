@@ -55,7 +55,7 @@ def look_of(label: str) -> Look:
 def shaded(label: str, place: int) -> Look:
     """Return a method's marker and line style in the colour of a level.
 
-    :param place: of the level among those that the figure compares
+    :param place: place of the level among those that the figure compares
     """
     look = look_of(label)
     return Look(SHADES[place % len(SHADES)], look.marker, look.line)

@@ -39,7 +39,7 @@ INTERVALS = (
 class Shown:
     """A figure of the page.
 
-    :param name: of the figure
+    :param name: name of the figure
     :param svg: the drawing; None if the figure was left out
     :param remarks: why it was left out, or what is missing in it
     """
@@ -51,7 +51,17 @@ class Shown:
 
 @dataclass(frozen=True)
 class Content:
-    """The content of the page."""
+    """The content of the page.
+
+    :param title: heading of the page
+    :param results: the runs that are in the report
+    :param cells: a row for each family, environment, method, sparsity and variant of settings
+    :param verdicts: the verdicts on the findings
+    :param figures: the figures, in order
+    :param left_out: runs, or files of runs, that are not in the report
+    :param pending: cells that are planned and not done
+    :param command: the command that continues what is pending; empty if there is none
+    """
 
     title: str
     results: Results

@@ -88,7 +88,7 @@ class Finding:
     :param sides: returns the scores of both sides by stratum
     :param region: the effects for which it holds
     :param statistic: the difference of this statistic is the effect
-    :param unit: of the effect
+    :param unit: unit of the effect
     """
 
     key: str

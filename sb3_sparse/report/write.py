@@ -36,9 +36,9 @@ def write_report(
     these runs stays as an earlier report in ``out`` drew it, or is left out; the page tells why.
     The same runs give the same bytes.
 
-    :param folders: of runs; the page names those that cannot be used
+    :param folders: folders of runs; the page names those that cannot be used
     :param out: folder to write to
-    :param title: of the page
+    :param title: title of the page
     :param figures: names of the figures, in order
     :param varies: setting that was varied, for the figure ``"sensitivity"``
     :param command: the command that continues what is pending

@@ -87,7 +87,7 @@ def _take_locks_first(engine: Any) -> None:
 
     @event.listens_for(engine, "begin")
     def begin(connection: Any) -> None:
-        connection.connection.dbapi_connection.isolation_level = None  # the driver shall not begin
+        connection.connection.dbapi_connection.isolation_level = None  # the driver must not begin
         connection.exec_driver_sql("BEGIN IMMEDIATE")
 
 

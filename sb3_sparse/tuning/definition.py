@@ -59,7 +59,7 @@ class Definition:
         return "_".join([*parts, self.space.name])
 
     def trials(self, wanted: int | None) -> int:
-        """Return how many trials the search shall have.
+        """Return the number of trials.
 
         :param wanted: None: every cell of a grid, else 100
         :raises ConfigError: for fewer than 1, or more than a grid has cells

@@ -31,7 +31,7 @@ class JournalFile(JournalFileBackend):
     A full disk or a power cut can leave half a line. Optuna would write the next record behind it,
     and could not read the journal any more. Here the half line moves into ``<journal>.torn``.
 
-    :param path: of the journal; a new one is made
+    :param path: path of the journal; a new one is made
     :raises ValueError: if the file is not a journal, or is damaged before its last line; the file
         then stays as it is
     """
@@ -136,7 +136,7 @@ class QueueJournal(FromQueue, JournalStorage, SignsOfLife):
     A worker touches the file of its trial in ``<journal>.alive/``. A trial whose file has not been
     touched for ``3 * interval`` is stale.
 
-    :param path: of the journal
+    :param path: path of the journal
     :param interval: seconds between two signs of life
     :param stale: called with each stale trial
     """
@@ -186,7 +186,7 @@ class QueueJournal(FromQueue, JournalStorage, SignsOfLife):
 def open_journal(path: Path, interval: int, stale: StaleCallback) -> BaseStorage:
     """Open a journal that workers take trials from; a new one is made.
 
-    :param path: of the file
+    :param path: path of the file
     :param interval: seconds between two signs of life
     :param stale: called with each stale trial
     :raises ValueError: if it is damaged before its last line, or is not a journal

@@ -21,7 +21,7 @@ def locked(storage: BaseStorage, name: str) -> Iterator[Callable[[], None]]:
     Making a study of a new name is the one step that every storage lets only one process take. The
     lock is such a study, and is deleted at the end.
 
-    :param name: of the search
+    :param name: name of the search
     :return: a function that gives a sign of life, to be called more often than once a minute
     """
     lock, seen, since = f"{name} is being filled", None, time.monotonic()

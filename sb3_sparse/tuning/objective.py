@@ -128,7 +128,7 @@ class _Report(BaseCallback):
     """A callback that reports each evaluation to the study, whose pruner may stop the run.
 
     :param trial: the trial that the run belongs to
-    :param scores: of the seeds that are done
+    :param scores: scores of the seeds that are done
     :param planned: evaluations of one seed
     :param seeds: runs of the trial
     """

@@ -48,7 +48,7 @@ def write_report(studies: Sequence[optuna.Study], storage: BaseStorage, path: Pa
     :param studies: Optuna's studies of the searches, e.g. :attr:`Tuned.study`
     :param storage: where other searches for the same algorithm and environment are looked up, for
         the table of the best of each method
-    :param path: of the page; the CSV has its name with ``.csv``
+    :param path: path of the page; the CSV has its name with ``.csv``
     :return: the page
     :raises ConfigError: if a search has no completed trial
     """
@@ -75,7 +75,7 @@ def report_by_name(
     """Write the page on searches, given by their names.
 
     :param storage: as in :func:`tune`
-    :param path: of the page; None: ``report.html`` in the first search's folder
+    :param path: path of the page; None: ``report.html`` in the first search's folder
     :return: the page
     :raises ConfigError: if a search does not exist, or has no completed trial
     """

@@ -64,7 +64,7 @@ def pruner_of(name: str, evaluations: int) -> BasePruner:
     :param name: ``"none"``, ``"median"`` (after five whole trials, not in a trial's first third),
         ``"halving"`` (asynchronous successive halving: the best third continues after a ninth and
         after a third of the evaluations) or ``"hyperband"``
-    :param evaluations: of a whole trial, over all its seeds
+    :param evaluations: evaluations of a whole trial, over all its seeds
     :raises ConfigError: for another name
     """
     check_choice("pruner", name, PRUNERS)
@@ -95,7 +95,7 @@ class SeededByTrial(BaseSampler):
     """A sampler that is made anew for each trial, with a seed of its own.
 
     :param make: makes a sampler from a seed
-    :param seed: of the search
+    :param seed: seed of the search
     """
 
     def __init__(self, make: Callable[[int], BaseSampler], seed: int) -> None:

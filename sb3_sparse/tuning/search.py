@@ -1,4 +1,4 @@
-"""Searches in a storage: made, joined, filled with waiting trials, looked at."""
+"""A search in a storage: make or join it, fill it with trials, read its status."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ ALIVE = (TrialState.WAITING, TrialState.RUNNING)
 
 @dataclass(frozen=True)
 class SearchStatus:
-    """How far a search is.
+    """The progress of a search.
 
     :param all: every trial that was begun, including lost and failed attempts
-    :param planned: how many trials the search shall have
+    :param planned: number of planned trials
     :param done: trials that were completed or pruned, in the order of their numbers
-    :param running: trials at work, or lost without anyone having noticed yet
+    :param running: trials that are running, or lost but not yet found lost
     :param failed: the last attempts at planned trials, where these failed
     """
 
@@ -72,7 +72,7 @@ class Search:
 
         Trials that failed wait again.
 
-        :param trials: how many the search shall have at least
+        :param trials: least number of trials
         :raises ConfigError: if the name belongs to another search
         """
         wanted = json.loads(json.dumps(definition.as_dict()))
@@ -123,7 +123,7 @@ class Search:
             return Definition.from_dict(self.study.user_attrs[DEFINITION])
 
     def status(self) -> SearchStatus:
-        """Return how far it is now."""
+        """Return its progress."""
         trials = self.study.get_trials(deepcopy=False)
         by_ticket = {ticket_of(trial): trial for trial in trials}  # the last attempt counts
         return SearchStatus(

@@ -48,8 +48,8 @@ def wide_space(method: str, sizes: Mapping[str, int], sparsity: float | None) ->
 
     :param method: ``"dense"`` or a topology method
     :param sizes: connections of each network of the policy, were it dense, by name
-    :param sparsity: of all networks together; None if each has its own, so that there is no common
-        budget to share out
+    :param sparsity: sparsity of all networks together; None if each has its own, so that there is
+        no common budget to share out
     :raises ConfigError: for an unknown method
     """
     searched: dict[str, BaseDistribution] = {

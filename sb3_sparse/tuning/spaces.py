@@ -28,7 +28,7 @@ OF_METHODS = frozenset({"update_interval", "drop_fraction", "begin", "end", "upd
 class Space:
     """Hyperparameters to search, by the names that ``--hyperparams`` knows.
 
-    :param name: for the search's name and for messages
+    :param name: name of the space, for the search's name and for messages
     :param distributions: Optuna's distribution of each; empty if ``code`` samples
     :param code: Python source that defines ``space``, a function of an Optuna trial that returns
         the values by name
@@ -159,7 +159,7 @@ def _suggest(trial: Trial, name: str, distribution: BaseDistribution) -> Any:
 def run_code(code: str, name: str) -> Any:
     """Return what a Python source defines as ``space``.
 
-    :param name: of the file, for messages
+    :param name: name of the file, for messages
     :raises ConfigError: if it fails, or does not define a mapping or a function
     """
     names: dict[str, Any] = {"__name__": "space"}

@@ -33,7 +33,7 @@ class Tuned:
     """The outcome of a search.
 
     :param study: Optuna's study of the search, with all trials
-    :param status: how far the search is
+    :param status: its progress
     :param folder: where the trials' folders, the workers' logs and ``best.yml`` are
     :param config: YAML file with the best values; None if no trial was completed
     :param began: whether anything was left to do
@@ -93,7 +93,7 @@ def tune(
         choices, else TPE
     :param pruner: ``"none"``, ``"median"``, ``"halving"`` or ``"hyperband"``; None: none for a
         grid, else median
-    :param name: of the search; None: algorithm, environment, method, sparsity and space
+    :param name: name of the search; None: algorithm, environment, method, sparsity and space
     :param storage: path of a journal file or URL of a database; None: ``tune/journal.log`` in
         ``log_folder``
     :param log_folder: where ``tune/<name>`` is made
@@ -138,7 +138,7 @@ def tune(
 def _check_outcome(
     name: str, status: SearchStatus, folder: Path, errors: Mapping[str, str]
 ) -> None:
-    """Raise if no trial is done and nobody is at work any more."""
+    """Raise if no trial is done or running."""
     if status.done or status.running or not (status.failed or errors):
         return
     texts = [

@@ -30,7 +30,7 @@ def work(
     """Take and train trials until all of a search are done, including those that others lose.
 
     :param storage: path or URL
-    :param name: of the search
+    :param name: name of the search
     :param folder: where the trials' folders go
     :param heartbeat: seconds between two signs of life
     :return: how many trials were ``"trained"`` and how many ``"failed"``
@@ -78,7 +78,7 @@ def work(
 class _Attempt:
     """The objective of one trial, which records the trial's number and its error.
 
-    :param objective: of the search
+    :param objective: objective of the search
     """
 
     def __init__(self, objective: Objective) -> None:

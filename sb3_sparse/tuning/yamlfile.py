@@ -47,9 +47,9 @@ def merge_entry(
 ) -> str:
     """Give one top-level entry of a YAML text new settings, and leave everything else as it is.
 
-    :param key: of the entry; a missing one is added at the end, based on ``default``
+    :param key: key of the entry; a missing one is added at the end, based on ``default``
     :param comment: a line for the entry, which replaces a line that begins with ``mark``
-    :param name: of the file, for messages
+    :param name: name of the file, for messages
     :return: the new text
     :raises ConfigError: if other entries would change too, or if the text cannot be parsed
     """
@@ -101,7 +101,7 @@ class _Entry:
 
     :param lines: the whole text
     :param document: the text as ruamel.yaml read it
-    :param key: of the entry
+    :param key: key of the entry
     """
 
     def __init__(self, lines: list[str], document: CommentedMap, key: str) -> None:

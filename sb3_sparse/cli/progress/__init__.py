@@ -1,4 +1,4 @@
-"""What a user sees while a command works: bars on a terminal, lines elsewhere."""
+"""Progress of commands: bars on a terminal, lines elsewhere."""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ class TuningProgress(Bar):
         self.task = self.bar.add_task("", total=None, status="starting")
 
     def __call__(self, status: SearchStatus) -> None:
-        """Show how far the search is."""
+        """Show the search's progress."""
         if self.seen is None:
             self.seen = {trial.number for trial in status.done}
             self.bar.start()

@@ -107,7 +107,7 @@ class Sheet:
     :param heads: columns of the numbers; those of lines end in x, value, low, high and seeds
     :param count: number of panels
     :param columns: panels in a row
-    :param height: of a row, in inches
+    :param height: height of a row, in inches
     """
 
     def __init__(
@@ -154,7 +154,7 @@ class Sheet:
     ) -> None:
         """Draw estimates as a line, and add their rows.
 
-        :param estimates: by the value that stands for ``x`` in their rows
+        :param estimates: the estimates by the value that stands for ``x`` in their rows
         """
         self.note(place, estimates)
         line(axes, x, ends_of(estimates.values()), look, label)
