@@ -9,10 +9,11 @@ from pathlib import Path
 import pytest
 
 from sb3_sparse.tuning.backend import optuna
-from sb3_sparse.tuning.choices import PRUNERS, SAMPLERS
+from sb3_sparse.tuning.choices import PRUNERS, SAMPLERS, SPACES
 from sb3_sparse.tuning.internals import CHECKED, CachedStorage, SignsOfLife, id_of
 from sb3_sparse.tuning.samplers import PRUNERS as MADE_PRUNERS
 from sb3_sparse.tuning.samplers import SAMPLERS as MADE_SAMPLERS
+from sb3_sparse.tuning.spacefile import SHIPPED
 from sb3_sparse.tuning.storage import open_storage
 
 ROOT = Path(__file__).parents[2]
@@ -62,3 +63,4 @@ def test_optuna_asks_a_storage_with_signs_of_life_for_its_stale_trials(tmp_path)
 def test_the_names_that_are_known_without_optuna_are_those_that_are_made():
     assert tuple(MADE_SAMPLERS) == SAMPLERS
     assert tuple(MADE_PRUNERS) == PRUNERS
+    assert tuple(SHIPPED) == SPACES
