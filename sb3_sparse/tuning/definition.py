@@ -12,6 +12,7 @@ from sb3_sparse.tuning.backend import optuna
 from sb3_sparse.tuning.objective import check_seeds, planned_evaluations
 from sb3_sparse.tuning.samplers import pruner_of, sampler_of
 from sb3_sparse.tuning.spaces import Space, check_space, one_of_each, with_values
+from sb3_sparse.zoo.folder import env_name
 from sb3_sparse.zoo.spec import RunSpec
 
 DEFAULT_TRIALS = 100
@@ -52,7 +53,7 @@ class Definition:
         """The search's name if the user gives none."""
         sparsity = self.run.settings().policy_kwargs["sparsity"]
         shares = sparsity.values() if isinstance(sparsity, Mapping) else [sparsity]
-        parts = [self.run.algo, self.run.env_id.replace("/", "-"), self.method]
+        parts = [self.run.algo, env_name(self.run.env_id), self.method]
         searched = "sparsity" in one_of_each(self.space)
         if self.method != "dense" and not searched:
             parts += [f"{share:g}" for share in shares]

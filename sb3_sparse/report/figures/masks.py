@@ -14,6 +14,7 @@ from sb3_sparse.report.data import Array, RunData
 from sb3_sparse.report.figures.base import Drawing, Sheet, figure
 from sb3_sparse.report.methods import name_of, percent
 from sb3_sparse.report.results import NotEnoughData, Results
+from sb3_sparse.zoo.folder import env_name
 
 HEADS = ("run", "method", "sparsity", "layer", "shape", "block row", "densities of the blocks")
 BLOCKS, LAYERS, CLOSE_TO = 128, 4, 0.9
@@ -86,7 +87,7 @@ def masks_of(run: RunData) -> list[tuple[str, tuple[int, ...], Array]]:
     :raises ConfigError: if there is no model
     :raises CorruptStateError: if it is damaged
     """
-    path = Path(run.folder) / f"{run.env_id.replace('/', '-')}.zip"
+    path = Path(run.folder) / f"{env_name(run.env_id)}.zip"
     state, found = plain_names(look_into(path).state), []
     for layer in run.layers:
         mask = state.get(f"{layer['name']}.weight_mask")
