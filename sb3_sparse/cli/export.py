@@ -12,7 +12,6 @@ from sb3_sparse.errors import ConfigError
 from sb3_sparse.export.formats import check_format
 
 RECORDED = 1000
-RECORDING_ENVS = 10
 
 
 def export_command(
@@ -39,6 +38,7 @@ def export_command(
     """
     check_format(to)
     from sb3_sparse.export import export_policy, record_observations
+    from sb3_sparse.export.write import main_file
     from sb3_sparse.zoo.saved import SavedModel
 
     saved = SavedModel.find(
@@ -49,12 +49,12 @@ def export_command(
         vecnormalize=vecnormalize,
         gym_packages=gym_packages or [],
     )
-    if to == "dense" and _as_zip(out).resolve() == saved.path.resolve():
+    if to == "dense" and main_file(out, ".zip").resolve() == saved.path.resolve():
         raise ConfigError(f"{saved.path} would be overwritten by its own export; give another name")
     loaded = saved.load()
     observations = None
     if saved.env_id is not None:
-        envs = saved.evaluation_envs(RECORDING_ENVS, 0)
+        envs = saved.evaluation_envs(RECORDED, 0)
         try:
             observations = record_observations(loaded, envs, RECORDED)
         finally:
@@ -71,8 +71,3 @@ def export_command(
     say(report)
     if observations is None:
         say("note: no observations were recorded; --env ID compares the policies on an environment")
-
-
-def _as_zip(out: Path) -> Path:
-    """Say where a dense zip is written."""
-    return out / "policy.zip" if out.is_dir() else out.with_suffix(".zip")

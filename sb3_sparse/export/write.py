@@ -147,7 +147,7 @@ def export_policy(
         artifact = GRAPH_ARTIFACTS[to](exact, int8)
         rounded = quantized(exact).run if int8 else None
         counts = _counts(raw, exact)
-    path = _main_file(Path(path), next(iter(artifact.files)))
+    path = main_file(Path(path), next(iter(artifact.files)))
     checked = partial(
         compare,
         recorded=observations,
@@ -229,7 +229,13 @@ def _connections(model: BaseAlgorithm) -> int:
     return sum(int(layer.weight.count_nonzero()) for layer in layers)
 
 
-def _main_file(path: Path, suffix: str) -> Path:
+def main_file(path: Path, suffix: str) -> Path:
+    """Return the file that an export writes, or its main one.
+
+    :param path: the file with or without its suffix, or a folder
+    :param suffix: suffix of the format
+    :raises ConfigError: for another suffix
+    """
     if path.is_dir():
         return path / f"policy{suffix}"
     if path.suffix == suffix:
