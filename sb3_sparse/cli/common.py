@@ -10,6 +10,8 @@ from rich.console import Console
 from rich.text import Text
 
 from sb3_sparse.errors import ConfigError
+from sb3_sparse.zoo.settings import parse_overrides
+from sb3_sparse.zoo.spec import RunSpec
 
 console = Console(highlight=False, markup=False)
 """Prints text unchanged: names of folders may contain what Rich takes for markup."""
@@ -94,7 +96,31 @@ def print_score(what: str, mean: float, std: float, path: Path) -> None:
     console.print(Text.assemble(f"{what:<13} ", score, f"  {path}"), soft_wrap=True)
 
 
-def values_and_packages(
+def run_spec(
+    context: typer.Context,
+    algo: str,
+    env: str,
+    hyperparams: list[str] | None,
+    gym_packages: list[str] | None,
+    **options: Any,
+) -> RunSpec:
+    """Make the specification of a run from the options of a command.
+
+    :param context: holds the words left over by all other options
+    :param options: further fields of the specification
+    :raises ConfigError: if a word belongs to no option, or a value is not allowed
+    """
+    values, packages = _values_and_packages(context.args, hyperparams, gym_packages)
+    return RunSpec(
+        algo=algo.lower(),
+        env_id=env,
+        hyperparams=parse_overrides(values),
+        gym_packages=tuple(packages),
+        **options,
+    )
+
+
+def _values_and_packages(
     extra: list[str], hyperparams: list[str] | None, gym_packages: list[str] | None
 ) -> tuple[list[str], list[str]]:
     """Split the words after ``--hyperparams`` and ``--gym-packages``, which take several each.

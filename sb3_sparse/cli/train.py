@@ -28,15 +28,14 @@ from sb3_sparse.cli.common import (
     console,
     option,
     print_score,
+    run_spec,
     say,
-    values_and_packages,
 )
 from sb3_sparse.errors import ConfigError, command
-from sb3_sparse.zoo.settings import parse_overrides
-from sb3_sparse.zoo.spec import RunSpec
 
 if TYPE_CHECKING:
     from sb3_sparse.zoo.results import Outcome
+    from sb3_sparse.zoo.spec import RunSpec
 
 SHORT = 1e-3  # by how much rounding may miss a sparsity
 
@@ -79,10 +78,12 @@ def train_command(
 
         _follow(f"Resuming {resumed}", partial(resume, resumed))
         return
-    values, packages = values_and_packages(context.args, hyperparams, gym_packages)
-    run = RunSpec(
-        algo=algo.lower(),
-        env_id=env,
+    run = run_spec(
+        context,
+        algo,
+        env,
+        hyperparams,
+        gym_packages,
         method=method,
         sparsity=sparsity,
         distribution=distribution,
@@ -90,12 +91,10 @@ def train_command(
         seed=seed,
         n_timesteps=n_timesteps,
         n_envs=n_envs,
-        hyperparams=parse_overrides(values),
         conf_file=conf_file,
         eval_freq=eval_freq,
         eval_episodes=eval_episodes,
         device=device,
-        gym_packages=tuple(packages),
     )
     headline = _headline(run)  # reports mistyped names before torch is imported
     from sb3_sparse.zoo.training import train

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -29,17 +28,17 @@ from sb3_sparse.cli.common import (
     Steps,
     console,
     option,
+    run_spec,
     say,
-    values_and_packages,
 )
 from sb3_sparse.cli.progress.tune import TuningProgress, values_in_words
+from sb3_sparse.errors import command
 from sb3_sparse.launch import launcher_named
 from sb3_sparse.tuning.choices import check_names
-from sb3_sparse.zoo.settings import parse_overrides
-from sb3_sparse.zoo.spec import RunSpec
 
 if TYPE_CHECKING:
     from sb3_sparse.tuning import Tuned
+    from sb3_sparse.zoo.spec import RunSpec
 
 SEARCH = "search"
 
@@ -112,24 +111,24 @@ def search(
 
     The same command continues an interrupted search, and joins it on another machine.
     """
-    values, packages = values_and_packages(context.args, hyperparams, gym_packages)
     check_names(space, sampler, pruner)
     chosen = launcher_named(launcher, address)
-    run = RunSpec(
-        algo=algo.lower(),
-        env_id=env,
+    run = run_spec(
+        context,
+        algo,
+        env,
+        hyperparams,
+        gym_packages,
         method=method,
         sparsity=sparsity,
         distribution=distribution,
         seed=seed,
         n_timesteps=n_timesteps,
         n_envs=n_envs,
-        hyperparams=parse_overrides(values),
         conf_file=conf_file,
         eval_freq=eval_freq,
         eval_episodes=eval_episodes,
         device=device,
-        gym_packages=tuple(packages),
     )
     run.config_entry()  # a typo shows before torch is imported
     from sb3_sparse.tuning import tune
@@ -156,7 +155,7 @@ def search(
         )
     except KeyboardInterrupt:
         progress.close()
-        console.print("Interrupted. Finished trials are kept; the same command continues.")
+        say("Interrupted. Finished trials are kept; the same command continues.")
         raise typer.Exit(INTERRUPTED) from None
     finally:
         progress.close()
@@ -187,15 +186,16 @@ def _print_outcome(run: RunSpec, tuned: Tuned, storage: str | None, log_folder: 
     if tuned.best is None or tuned.config is None:
         return
     best = tuned.best
-    say(f"Best: {best.values[0]:.6g}, trial {best.number}: {values_in_words(best)}")
+    values = values_in_words(status.values_of(best))
+    say(f"Best: {best.values[0]:.6g}, trial {best.number}: {values}")
     say("Train with these values, look at the search:")
     where = [] if storage is None else ["--storage", shown_url(storage)]
     where += [] if log_folder == Path("logs") else ["--log-folder", str(log_folder)]
-    train = ["train", "--algo", run.algo, "--env", run.env_id, "--conf-file", str(tuned.config)]
+    train = ["train", "--algo", run.algo, "--env", run.env_id, "--conf-file", tuned.config]
     for package in run.gym_packages:
         train += ["--gym-packages", package]
-    for command in (train, ["tune", "report", name, *where]):
-        say(shlex.join(["sb3-sparse", *command]))
+    say(command(*train))
+    say(command("tune", "report", name, *where))
 
 
 @tuning.command()

@@ -56,6 +56,16 @@ class SearchStatus:
         """Whether every planned trial is done."""
         return len({ticket_of(trial) for trial in self.done}) >= self.planned
 
+    @staticmethod
+    def values_of(trial: FrozenTrial) -> dict[str, Any]:
+        """Return a trial's hyperparameters by name."""
+        return dict(trial.user_attrs.get(VALUES, trial.params))
+
+    @staticmethod
+    def why_failed(trial: FrozenTrial) -> str:
+        """Return why a trial failed."""
+        return str(trial.user_attrs.get(ERROR, "no reason known"))
+
 
 class Search:
     """A search for hyperparameters, which a study of Optuna's holds.

@@ -15,7 +15,7 @@ from sb3_sparse.launch import Launcher, Task, check_workers, launcher_named
 from sb3_sparse.tuning.backend import FrozenTrial, optuna, quiet_optuna
 from sb3_sparse.tuning.best import BEST, write_best
 from sb3_sparse.tuning.definition import Definition
-from sb3_sparse.tuning.search import ERROR, Search, SearchStatus, folder_name
+from sb3_sparse.tuning.search import Search, SearchStatus, folder_name
 from sb3_sparse.tuning.spacefile import space_of
 from sb3_sparse.tuning.spaces import Space
 from sb3_sparse.tuning.storage import FOLDER, HEARTBEAT, JOURNAL, open_storage
@@ -142,7 +142,7 @@ def _check_outcome(
     if status.done or status.running or not (status.failed or errors):
         return
     texts = [
-        f"trial {trial.number}: {trial.user_attrs.get(ERROR, 'no reason known')}"
+        f"trial {trial.number}: {status.why_failed(trial)}"
         for trial in sorted(status.failed, key=lambda trial: trial.number)
     ] or [f"{worker}: {error.strip().splitlines()[-1]}" for worker, error in errors.items()]
     count = len(status.failed)

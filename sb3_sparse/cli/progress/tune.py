@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.progress import TimeElapsedColumn
@@ -14,9 +15,8 @@ if TYPE_CHECKING:
     from sb3_sparse.tuning.search import SearchStatus
 
 
-def values_in_words(trial: FrozenTrial) -> str:
+def values_in_words(values: Mapping[str, Any]) -> str:
     """Return a trial's values in a line."""
-    values = trial.user_attrs.get("hyperparams", trial.params)
     return ", ".join(f"{name} {_short(value)}" for name, value in values.items())
 
 
@@ -52,12 +52,11 @@ class TuningProgress(Bar):
     @staticmethod
     def _line(trial: FrozenTrial, status: SearchStatus) -> str:
         if trial in status.failed:
-            return (
-                f"trial {trial.number} failed: {trial.user_attrs.get('error', 'no reason known')}"
-            )
+            return f"trial {trial.number} failed: {status.why_failed(trial)}"
         best = status.best
         how = "pruned at" if trial not in status.complete else "score"
         value = f"{trial.values[0]:.6g}" if trial.values else "–"
         so_far = "" if best is None else f", best so far {best.values[0]:.6g} (trial {best.number})"
         count = f"{len(status.done)} of {status.planned}"
-        return f"{count}: trial {trial.number} {how} {value}{so_far}; {values_in_words(trial)}"
+        values = values_in_words(status.values_of(trial))
+        return f"{count}: trial {trial.number} {how} {value}{so_far}; {values}"
