@@ -53,9 +53,7 @@ def enjoy_command(
     finally:
         progress.close()
     say(f"Return over {score.episodes} episodes:")
-    whose = "Best policy:" if score.model.name == "best_model.zip" else "Last policy:"
-    if not model.is_dir():
-        whose = "Policy:"
+    whose = ("Best policy:" if best else "Last policy:") if model.is_dir() else "Policy:"
     print_score(whose, score.mean_return, score.std_return, score.model)
     for path in score.videos:
         say(f"Video: {path}")
