@@ -16,6 +16,7 @@ from sb3_sparse.lazy import lazily
 from sb3_sparse.policies.registry import (
     CONTRIB,
     SparsePolicy,
+    SparseSimbaPolicy,
     register_policy,
     registered,
     supported_algorithms,
@@ -56,6 +57,7 @@ __all__ = [
     "SparseDQNPolicy",
     "SparsePolicy",
     "SparseSACPolicy",
+    "SparseSimbaPolicy",
     "SparseTD3Policy",
     "SparsityCallback",
     "register_policy",

@@ -46,16 +46,21 @@ def by_modules(x: th.Tensor) -> bool:
 
 
 class Step(NamedTuple):
-    """One layer and the activation behind it.
+    """One layer, and what surrounds it as in :class:`~sb3_sparse.engine.paths.Part`.
 
     :param layer: the layer
     :param activation: None: no activation
+    :param norm: LayerNorm of its input; None: there is none
     :param source: number of the step that gives its input; -1: the observations
+    :param shortcut: number of the step whose result is added, -1: the observations; None: nothing
+        is added
     """
 
     layer: nn.Linear
     activation: nn.Module | None
+    norm: nn.LayerNorm | None
     source: int
+    shortcut: int | None
 
 
 class Binding(NamedTuple):
@@ -90,7 +95,7 @@ class Inference:
         hooks = ((vars(m)["_forward_hooks"], vars(m)["_forward_pre_hooks"]) for m in modules)
         self._hooks = list(chain.from_iterable(hooks))
         self._tensors: list[th.Tensor] = [
-            tensor for layer in self._layers for tensor in _tensors_of(layer) if tensor is not None
+            tensor for step in steps for tensor in _tensors_of(step) if tensor is not None
         ]
         numbers = {id(tensor): number for number, tensor in enumerate(self._tensors)}
         self._values = [numbers[id(layer.weight)] for layer in self._sparse]
@@ -115,19 +120,19 @@ class Inference:
             if not parts:
                 return None
             key: tuple[int, ...] = ()
-            source = -1
-            for layer, activation in parts:
-                key += (id(layer), id(activation))
+            numbers = [-1]  # of the steps of this path, behind the observations
+            for layer, activation, norm, shortcut in parts:
+                if layer is None:
+                    return None
+                key += (id(layer), id(activation), id(norm), -2 if shortcut is None else shortcut)
                 if key not in places:
                     places[key] = len(steps)
-                    steps.append(Step(layer, activation, source))
-                source = places[key]
-            ends.append(source)
+                    added = None if shortcut is None else numbers[shortcut + 1]
+                    steps.append(Step(layer, activation, norm, numbers[-1], added))
+                numbers.append(places[key])
+            ends.append(numbers[-1])
         inputs = {step.layer.in_features for step in steps if step.source < 0}
-        if any(
-            step.source >= 0 and step.layer.in_features != steps[step.source].layer.out_features
-            for step in steps
-        ):
+        if not all(_fits(step, steps) for step in steps):
             return None
         if len(steps) > MOST_STEPS or len(set(ends)) < len(ends) or len(inputs) > 1:
             return None
@@ -257,9 +262,10 @@ class Inference:
         :param held: the layers' tensors, in order
         """
         fields: list[int] = []
-        for number, (layer, activation, source) in enumerate(self._steps):
+        for number, step in enumerate(self._steps):
+            layer = step.layer
             shape = layer.out_features, layer.in_features
-            sizes: list[tuple[int, ...]] = [shape, (shape[0],), shape]
+            sizes: list[tuple[int, ...]] = [shape, shape[:1], shape, shape[1:], shape[1:]]
             start = column = 0
             if isinstance(layer, SparseLinear):
                 structure = next(structures)
@@ -268,7 +274,7 @@ class Inference:
                 if structure.shape != shape:
                     return None
             places = []
-            for tensor, size in zip(_tensors_of(layer), sizes, strict=True):
+            for tensor, size in zip(_tensors_of(step), sizes, strict=True):
                 place = 0
                 if tensor is not None:
                     now = next(held)
@@ -276,16 +282,35 @@ class Inference:
                         return None
                     place = now.data_ptr()
                 places.append(place)
-            weight, bias, mask = places
-            kind, a, b = number_of(activation)
+            weight, bias, mask, scale, shift = places
+            kind, a, b = number_of(step.activation)
             out = -1
             if number in self._ends:
                 out = self._places[self._ends.index(number)]
             fields += (*shape, start, column, weight, mask, bias)
-            fields += (kind, bits_of(a), bits_of(b), source, out)
+            fields += (kind, bits_of(a), bits_of(b), step.source, out)
+            epsilon = -1.0 if step.norm is None else step.norm.eps
+            fields += (bits_of(epsilon), scale, shift)
+            fields.append(-2 if step.shortcut is None else step.shortcut)
         return (ctypes.c_int64 * len(fields))(*fields)
 
 
-def _tensors_of(layer: nn.Linear) -> tuple[th.Tensor | None, ...]:
-    """Return the weight, bias and mask of a layer."""
-    return layer.weight, layer.bias, layer._buffers.get(FLOAT_MASK_KEY)
+def _tensors_of(step: Step) -> tuple[th.Tensor | None, ...]:
+    """Return the weight, bias and mask of a step's layer, and its norm's scale and shift."""
+    layer, norm = step.layer, step.norm
+    affine = (None, None) if norm is None else (norm.weight, norm.bias)
+    return layer.weight, layer.bias, layer._buffers.get(FLOAT_MASK_KEY), *affine
+
+
+def _fits(step: Step, steps: list[Step]) -> bool:
+    """Whether a step, its norm and what is added to it agree in their numbers of features."""
+    columns, rows = step.layer.in_features, step.layer.out_features
+
+    def width(source: int, first: int) -> int:
+        return first if source < 0 else steps[source].layer.out_features
+
+    return (
+        width(step.source, columns) == columns
+        and (step.norm is None or step.norm.normalized_shape == (columns,))
+        and (step.shortcut is None or width(step.shortcut, steps[0].layer.in_features) == rows)
+    )

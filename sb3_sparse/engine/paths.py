@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from typing import NamedTuple
 
 from torch import nn
 
 from sb3_sparse.engine.activations import ACTIVATIONS
 from sb3_sparse.engine.linear import SparseLinear
+from sb3_sparse.engine.residual import Residual
 
 Paths = Sequence[Sequence[nn.Module]]
 """The modules of each network, in the order of computation."""
@@ -15,26 +17,66 @@ OWN = ("torch.nn.", "sb3_sparse.engine.")
 """Modules that define a plain ``Sequential``; a user's subclass may do more than call its parts."""
 
 
-def parts_of(path: Iterable[nn.Module]) -> list[tuple[nn.Linear, nn.Module | None]] | None:
-    """Split a path into layers, each with its activation; None if it has any other module."""
-    parts: list[tuple[nn.Linear, nn.Module | None]] = []
-    for module in _leaves(path):
-        if type(module) in (nn.Linear, SparseLinear):
-            assert isinstance(module, nn.Linear)
-            parts.append((module, None))
-        elif type(module) in ACTIVATIONS and parts and parts[-1][1] is None:
-            parts[-1] = (parts[-1][0], module)
-        elif type(module) is not nn.Identity:
-            return None
+class Part(NamedTuple):
+    """A linear layer and what surrounds it: ``activation(layer(norm(x))) + shortcut``.
+
+    :param layer: None for a LayerNorm at the end of a path, which has no layer behind it
+    :param activation: None: no activation
+    :param norm: LayerNorm of the layer's input; None: there is none
+    :param shortcut: number of the part whose result is added, -1 for the input of the path; None:
+        nothing is added
+    """
+
+    layer: nn.Linear | None
+    activation: nn.Module | None = None
+    norm: nn.LayerNorm | None = None
+    shortcut: int | None = None
+
+
+def parts_of(path: Iterable[nn.Module]) -> list[Part] | None:
+    """Split a path into layers and what surrounds them; None if it has any other module."""
+    parts: list[Part] = []
+    if not _split(path, parts):
+        return None
     return parts
 
 
-def _leaves(path: Iterable[nn.Module]) -> Iterable[nn.Module]:
+def _split(path: Iterable[nn.Module], parts: list[Part]) -> bool:
+    """Append the parts of a path; False if it has a module that no part can hold."""
     for module in path:
+        last = parts[-1] if parts else None
+        behind_norm = last is not None and last.layer is None
         if isinstance(module, nn.Sequential) and type(module).__module__.startswith(OWN):
-            yield from _leaves(module)
-        else:
-            yield module
+            if not _split(module, parts):
+                return False
+        elif isinstance(module, Residual):
+            if behind_norm or not _split_residual(module, parts):
+                return False
+        elif type(module) in (nn.Linear, SparseLinear):
+            assert isinstance(module, nn.Linear)
+            norm = parts.pop().norm if behind_norm else None
+            parts.append(Part(module, norm=norm))
+        elif type(module) is nn.LayerNorm:
+            if behind_norm or len(module.normalized_shape) != 1:
+                return False
+            parts.append(Part(None, norm=module))
+        elif type(module) in ACTIVATIONS:
+            if last is None or last[1:] != (None, last.norm, None) or behind_norm:
+                return False
+            parts[-1] = last._replace(activation=module)
+        elif type(module) is not nn.Identity:
+            return False
+    return True
+
+
+def _split_residual(module: Residual, parts: list[Part]) -> bool:
+    before = len(parts)
+    if type(module).forward is not Residual.forward or not _split([module.residual], parts):
+        return False
+    if len(parts) == before or parts[-1].layer is None or parts[-1].shortcut is not None:
+        return False
+    parts[-1] = parts[-1]._replace(shortcut=before - 1)
+    return True
 
 
 def modules_of(paths: Paths) -> list[nn.Module]:

@@ -10,7 +10,7 @@ from sb3_sparse.engine.paths import parts_of
 from sb3_sparse.fused.errors import NotCovered
 from sb3_sparse.fused.program import Parts
 
-KNOWN_MODULES = (nn.Linear, SparseLinear, nn.Identity, *ACTIVATIONS)
+KNOWN_MODULES = (nn.Linear, SparseLinear, nn.LayerNorm, nn.Identity, *ACTIVATIONS)
 
 
 def parts(*modules: nn.Module) -> Parts:

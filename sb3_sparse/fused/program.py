@@ -8,6 +8,7 @@ import torch as th
 from torch import nn
 
 from sb3_sparse.engine.activations import number_of, tells_its_slope
+from sb3_sparse.engine.paths import Part
 from sb3_sparse.fused.descent import Descent
 from sb3_sparse.fused.errors import NotCovered
 from sb3_sparse.fused.operations import Operation
@@ -16,7 +17,7 @@ from sb3_sparse.fused.values import Value
 
 WITH_SLOPE_AT_INPUT = (nn.SiLU, nn.GELU)
 RELU, _, _ = number_of(nn.ReLU())
-Parts = Sequence[tuple[nn.Linear, nn.Module | None]]
+Parts = Sequence[Part]
 
 
 class Program(Recording):
@@ -53,6 +54,8 @@ class Program(Recording):
 
     def parameter(self, tensor: th.Tensor) -> Value:
         """Read a vector of parameters that is not part of a layer."""
+        if id(tensor) in self.vectors:
+            return self.vectors[id(tensor)]
         value = Value(self, tensor.numel(), False)
         self.record("SPREAD", value, number=self.slot(tensor, None), tiled=False)
         self.vectors[id(tensor)] = value
@@ -77,13 +80,28 @@ class Program(Recording):
         return made
 
     def network(self, parts: Parts, x: Value) -> Value:
-        """Apply linear layers and their activations in turn.
+        """Apply linear layers, their norms, activations and shortcuts in turn.
 
         :raises NotCovered: for an activation that the kernels do not know
         """
-        for module, activation in parts:
-            x = self._linear(module, activation, x)
+        results = [x]
+        for layer, activation, norm, shortcut in parts:
+            if norm is not None:
+                x = self._layer_norm(norm, x)
+            if layer is not None:
+                x = self._linear(layer, activation, x)
+            if shortcut is not None:
+                x = x + results[shortcut + 1]
+            results.append(x)
         return x
+
+    def _layer_norm(self, norm: nn.LayerNorm, x: Value) -> Value:
+        if norm.normalized_shape != (x.features,):
+            raise NotCovered(f"a LayerNorm of {norm.normalized_shape} features gets {x.features}")
+        y = x.layer_norm(norm.eps)
+        if norm.weight is not None:
+            y = y * self.parameter(norm.weight)
+        return y if norm.bias is None else y + self.parameter(norm.bias)
 
     def _linear(self, module: nn.Linear, activation: nn.Module | None, x: Value) -> Value:
         if module.in_features != x.features:
@@ -182,16 +200,16 @@ class Program(Recording):
 
         :param tau: weight of the online network
         """
-        for (online, _), (target, _) in zip(network, target_network, strict=True):
-            numbers = [self._layer(online), self._layer(target)]
-            tensors: list[tuple[th.Tensor | None, th.Tensor | None, bool]] = [
-                (online.weight, target.weight, True), (online.bias, target.bias, False)
-            ]  # fmt: skip
-            for one, two, weight in tensors:
-                if one is None or two is None:
-                    continue
-                first, last = (
-                    self.slot(tensor, number if weight else None)
-                    for tensor, number in zip((one, two), numbers, strict=True)
-                )
-                self.record("POLYAK", None, tau, first=first, last=last, tiled=False, changes=True)
+        for online, target in zip(network, target_network, strict=True):
+            for one, two in zip(self._slots_of(online), self._slots_of(target), strict=True):
+                self.record("POLYAK", None, tau, first=one, last=two, tiled=False, changes=True)
+
+    def _slots_of(self, part: Part) -> list[int]:
+        """Add each parameter of a part to the table; return their numbers."""
+        numbers = []
+        if part.layer is not None:
+            numbers.append(self.slot(part.layer.weight, self._layer(part.layer)))
+        vectors = [module.bias for module in (part.layer, part.norm) if module is not None]
+        if part.norm is not None:
+            vectors.append(part.norm.weight)
+        return numbers + [self.slot(vector, None) for vector in vectors if vector is not None]

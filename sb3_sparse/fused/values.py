@@ -221,6 +221,24 @@ class Value:
         self.program.record("SUM_FEATURES", made, self, first=self.features)
         return made
 
+    def layer_norm(self, epsilon: float) -> Value:
+        """Shift and scale each entry's features to mean 0 and variance 1.
+
+        :param epsilon: added to the variance
+        """
+        share = 1.0 / self.features
+        x = self.detach()
+        centred = x - x.sum_features() * share
+        deviation = (centred.square().sum_features() * share + epsilon).sqrt()
+        made = centred / deviation
+
+        def back(g: Value) -> Value:
+            along = made * ((g * made).sum_features() * share)
+            return (g - g.sum_features() * share - along) / deviation
+
+        made.parents = ((self, back),)
+        return made
+
     def max_features(self) -> Value:
         """Compute the maximum over features, without a gradient."""
         made = Value(self.program, 1, self.batched)

@@ -2,5 +2,6 @@
 
 from sb3_sparse.networks.impala import ImpalaCNN
 from sb3_sparse.networks.nature import ScaledNatureCNN
+from sb3_sparse.networks.simba import SimbaBlock, simba
 
-__all__ = ["ImpalaCNN", "ScaledNatureCNN"]
+__all__ = ["ImpalaCNN", "ScaledNatureCNN", "SimbaBlock", "simba"]

@@ -10,13 +10,16 @@ import torch as th
 from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.distributions import DiagGaussianDistribution, Distribution
 from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.type_aliases import Schedule
 
 from sb3_sparse.errors import UnsupportedError
+from sb3_sparse.networks.simba import initialise
 from sb3_sparse.policies.base import BaseSparsePolicy
 from sb3_sparse.policies.fast_distributions import FastCategorical, FastGaussian, fast_distribution
 from sb3_sparse.policies.fast_forward import FastForward, overrides
 from sb3_sparse.policies.fast_predict import Actions
-from sb3_sparse.policies.registry import register_policy, variants_of
+from sb3_sparse.policies.registry import register_policy, register_variant, variants_of
+from sb3_sparse.policies.simba import SimbaPolicy, with_simba
 from sb3_sparse.policies.spec import NetworkSpec, PassCounts
 
 ACTOR = ("mlp_extractor.policy_net", "action_net")
@@ -153,3 +156,36 @@ class SparseActorCriticPolicy(BaseSparsePolicy, ActorCriticPolicy):
 SparseActorCriticMlpPolicy, SparseActorCriticCnnPolicy, SparseActorCriticMultiInputPolicy = (
     variants_of(SparseActorCriticPolicy)
 )
+
+
+@register_variant(SparseActorCriticPolicy, "Simba")
+class SparseActorCriticSimbaPolicy(SimbaPolicy, SparseActorCriticPolicy):
+    """Sparse SimBa networks for PPO, A2C and TRPO.
+
+    ``ortho_init`` concerns the output layers alone.
+
+    Example::
+
+        from sb3_sparse import PPO
+
+        kwargs = dict(sparsity=0.8, net_arch=dict(pi=[64], vf=[64, 64]))
+        model = PPO("SparseSimbaPolicy", "CartPole-v1", policy_kwargs=kwargs)
+    """
+
+    default_arch = {"pi": [128], "vf": [256, 256]}
+
+    def _build_mlp_extractor(self) -> None:
+        super()._build_mlp_extractor()
+        extractor: Any = self.mlp_extractor
+        for name in ("policy_net", "value_net"):
+            perceptron = getattr(extractor, name)
+            setattr(extractor, name, with_simba(perceptron, len(perceptron) // 2).to(self.device))
+
+    def _build(self, lr_schedule: Schedule) -> None:
+        super()._build(lr_schedule)
+        initialise(self.mlp_extractor)  # SB3 has drawn all layers anew for ortho_init
+
+    def _initial_gain(self, layer_name: str) -> float:
+        if self.ortho_init and layer_name in ("action_net", "value_net"):
+            return SparseActorCriticPolicy._initial_gain(self, layer_name)
+        return super()._initial_gain(layer_name)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 from importlib.util import find_spec
-from typing import Any
+from typing import Any, ClassVar
 
 import torch as th
 from gymnasium import spaces
@@ -21,10 +21,12 @@ from sb3_sparse.policies.gaussian_actor import GaussianActor
 from sb3_sparse.policies.modules import ActingModule, PredictsByModule
 from sb3_sparse.policies.registry import (
     register_policy,
+    register_variant,
     reject,
     variants_of,
 )
 from sb3_sparse.policies.sac import GAUSSIAN_ACTING, GAUSSIAN_ACTOR, TWIN_CRITIC, sac_passes
+from sb3_sparse.policies.simba import SimbaActingModule, SimbaCritic, SimbaPolicy
 from sb3_sparse.policies.spec import NetworkSpec, PassCounts
 
 if find_spec("sb3_contrib") is None:
@@ -68,6 +70,29 @@ class SparseTQCPolicy(SparseCriticsMixin, TQCPolicy):
 SparseTQCMlpPolicy, SparseTQCCnnPolicy, SparseTQCMultiInputPolicy = variants_of(SparseTQCPolicy)
 
 
+class SimbaTQCActor(SimbaActingModule, SparseTQCActor):
+    """Actor of TQC that is a SimBa network."""
+
+
+class SimbaTQCCritic(SimbaCritic, SparseTQCCritic):
+    """Quantile critics of TQC that are SimBa networks."""
+
+
+@register_variant(SparseTQCPolicy, "Simba")
+class SparseTQCSimbaPolicy(SimbaPolicy, SparseTQCPolicy):
+    """Sparse SimBa networks for TQC.
+
+    Example::
+
+        from sb3_contrib import TQC
+
+        model = TQC("SparseSimbaPolicy", "Pendulum-v1", policy_kwargs=dict(sparsity=0.8))
+    """
+
+    actor_class = SimbaTQCActor
+    critic_class = SimbaTQCCritic
+
+
 class SparseQuantileNetwork(ActingModule, QuantileNetwork):
     """Quantile network of QR-DQN."""
 
@@ -105,6 +130,7 @@ class SparseQRDQNPolicy(PredictsByModule, BaseSparsePolicy, QRDQNPolicy):
     acting = ("quantile_net.features_extractor", "quantile_net.quantile_net")
     acting_quantiles = "quantile_net.n_quantiles"
     action_spaces = (spaces.Discrete,)
+    quantile_net_class: ClassVar[type[SparseQuantileNetwork]] = SparseQuantileNetwork
     quantile_net: SparseQuantileNetwork
     networks = {
         "quantile_net": NetworkSpec(
@@ -116,14 +142,33 @@ class SparseQRDQNPolicy(PredictsByModule, BaseSparsePolicy, QRDQNPolicy):
     }
 
     def make_quantile_net(self) -> SparseQuantileNetwork:
-        """As in sb3-contrib, but a :class:`SparseQuantileNetwork`."""
+        """As in sb3-contrib, with :attr:`quantile_net_class`."""
         kwargs = self._update_features_extractor(self.net_args, features_extractor=None)
-        return SparseQuantileNetwork(**kwargs).to(self.device)
+        return self.quantile_net_class(**kwargs).to(self.device)
 
 
 SparseQRDQNMlpPolicy, SparseQRDQNCnnPolicy, SparseQRDQNMultiInputPolicy = variants_of(
     SparseQRDQNPolicy
 )
+
+
+class SimbaQuantileNetwork(SimbaActingModule, SparseQuantileNetwork):
+    """Quantile network of QR-DQN that is a SimBa network."""
+
+
+@register_variant(SparseQRDQNPolicy, "Simba")
+class SparseQRDQNSimbaPolicy(SimbaPolicy, SparseQRDQNPolicy):
+    """Sparse SimBa network for QR-DQN.
+
+    Example::
+
+        from sb3_contrib import QRDQN
+
+        model = QRDQN("SparseSimbaPolicy", "CartPole-v1", policy_kwargs=dict(sparsity=0.8))
+    """
+
+    default_arch = [256, 256]
+    quantile_net_class = SimbaQuantileNetwork
 
 
 class SoundBatchRenorm1d(BatchRenorm1d):

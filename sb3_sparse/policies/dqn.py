@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import torch as th
 from gymnasium import spaces
@@ -13,7 +13,8 @@ from stable_baselines3.dqn.policies import DQNPolicy, QNetwork
 from sb3_sparse.policies.base import BaseSparsePolicy
 from sb3_sparse.policies.fast_predict import Actions
 from sb3_sparse.policies.modules import ActingModule, PredictsByModule
-from sb3_sparse.policies.registry import register_policy, variants_of
+from sb3_sparse.policies.registry import register_policy, register_variant, variants_of
+from sb3_sparse.policies.simba import SimbaActingModule, SimbaPolicy
 from sb3_sparse.policies.spec import NetworkSpec, PassCounts
 
 
@@ -52,6 +53,7 @@ class SparseDQNPolicy(PredictsByModule, BaseSparsePolicy, DQNPolicy):
 
     acting = ("q_net.features_extractor", "q_net.q_net")
     action_spaces = (spaces.Discrete,)
+    q_net_class: ClassVar[type[SparseQNetwork]] = SparseQNetwork
     q_net: SparseQNetwork
     networks = {
         "q_net": NetworkSpec(
@@ -63,9 +65,29 @@ class SparseDQNPolicy(PredictsByModule, BaseSparsePolicy, DQNPolicy):
     }
 
     def make_q_net(self) -> SparseQNetwork:
-        """As in SB3, but a :class:`SparseQNetwork`."""
+        """As in SB3, with :attr:`q_net_class`."""
         kwargs = self._update_features_extractor(self.net_args, features_extractor=None)
-        return SparseQNetwork(**kwargs).to(self.device)
+        return self.q_net_class(**kwargs).to(self.device)
 
 
 SparseDQNMlpPolicy, SparseDQNCnnPolicy, SparseDQNMultiInputPolicy = variants_of(SparseDQNPolicy)
+
+
+class SimbaQNetwork(SimbaActingModule, SparseQNetwork):
+    """Q network of DQN that is a SimBa network."""
+
+
+@register_variant(SparseDQNPolicy, "Simba")
+class SparseDQNSimbaPolicy(SimbaPolicy, SparseDQNPolicy):
+    """Sparse SimBa network for DQN.
+
+    Example::
+
+        from sb3_sparse import DQN
+
+        kwargs = dict(sparsity=0.9, net_arch=[128, 128])
+        model = DQN("SparseSimbaPolicy", "CartPole-v1", policy_kwargs=kwargs)
+    """
+
+    default_arch = [256, 256]
+    q_net_class = SimbaQNetwork

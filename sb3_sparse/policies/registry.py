@@ -26,6 +26,8 @@ if TYPE_CHECKING:  # imported when an algorithm is, not when one is named
 
 SparsePolicy = "SparsePolicy"
 """The sparse policy of whichever algorithm it is passed to."""
+SparseSimbaPolicy = "SparseSimbaPolicy"
+"""The sparse policy of SimBa networks, of whichever algorithm it is passed to."""
 SB3 = {
     "DQN": "dqn",
     "SAC": "sac",
@@ -64,7 +66,7 @@ class Registration:
 
 
 _registered: dict[str, Registration] = {}
-_variants: dict[type[BaseSparsePolicy], Mapping[str, type[BaseSparsePolicy]]] = {}
+_variants: dict[type[BaseSparsePolicy], dict[str, type[BaseSparsePolicy]]] = {}
 _rejected: list[type[BaseAlgorithm]] = []
 
 
@@ -133,11 +135,29 @@ def variants_of(policy: type[Policy], *prefixes: str) -> list[type[Policy]]:
         }
         name = policy.__name__.removesuffix("Policy") + prefix + "Policy"
         found[prefix] = type(name, (policy,), members)
-    _variants[policy] = found
+    _add_variants(policy, found)
+    return list(found.values())
+
+
+def register_variant(policy: type[Policy], prefix: str) -> Callable[[type[Policy]], type[Policy]]:
+    """Class decorator that registers a subclass of a sparse policy as ``Sparse<prefix>Policy``.
+
+    :param policy: a registered policy class
+    :param prefix: e.g. ``"Simba"``
+    """
+
+    def register(variant: type[Policy]) -> type[Policy]:
+        _add_variants(policy, {prefix: variant})
+        return variant
+
+    return register
+
+
+def _add_variants(policy: type[Any], variants: Mapping[str, type[Any]]) -> None:
+    _variants.setdefault(policy, {}).update(variants)
     for one in _registered.values():
         if one.policy is policy:
-            _add_aliases(one.algorithm, found)
-    return list(found.values())
+            _add_aliases(one.algorithm, variants)
 
 
 def _add_aliases(algorithm: type[BaseAlgorithm], policies: Mapping[str, Any]) -> None:

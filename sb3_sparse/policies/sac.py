@@ -9,7 +9,8 @@ from stable_baselines3.sac.policies import Actor, SACPolicy
 
 from sb3_sparse.policies.critics import SparseCriticsMixin
 from sb3_sparse.policies.gaussian_actor import GaussianActor
-from sb3_sparse.policies.registry import register_policy, variants_of
+from sb3_sparse.policies.registry import register_policy, register_variant, variants_of
+from sb3_sparse.policies.simba import SimbaActingModule, SimbaContinuousCritic, SimbaPolicy
 from sb3_sparse.policies.spec import NetworkSpec, PassCounts
 
 GAUSSIAN_ACTOR = NetworkSpec(
@@ -60,3 +61,23 @@ class SparseSACPolicy(SparseCriticsMixin, SACPolicy):
 
 
 SparseSACMlpPolicy, SparseSACCnnPolicy, SparseSACMultiInputPolicy = variants_of(SparseSACPolicy)
+
+
+class SimbaSACActor(SimbaActingModule, SparseSACActor):
+    """Actor of SAC that is a SimBa network."""
+
+
+@register_variant(SparseSACPolicy, "Simba")
+class SparseSACSimbaPolicy(SimbaPolicy, SparseSACPolicy):
+    """Sparse SimBa networks for SAC.
+
+    Example::
+
+        from sb3_sparse import SAC
+
+        kwargs = dict(sparsity=0.9, net_arch=dict(pi=[64], qf=[128, 128]))
+        model = SAC("SparseSimbaPolicy", "Pendulum-v1", policy_kwargs=kwargs)
+    """
+
+    actor_class = SimbaSACActor
+    critic_class = SimbaContinuousCritic

@@ -11,8 +11,9 @@ from stable_baselines3.td3.policies import Actor, TD3Policy
 from sb3_sparse.policies.critics import SparseCriticsMixin
 from sb3_sparse.policies.fast_predict import Actions
 from sb3_sparse.policies.modules import ActingModule
-from sb3_sparse.policies.registry import register_policy, variants_of
+from sb3_sparse.policies.registry import register_policy, register_variant, variants_of
 from sb3_sparse.policies.sac import TWIN_CRITIC
+from sb3_sparse.policies.simba import SimbaActingModule, SimbaContinuousCritic, SimbaPolicy
 from sb3_sparse.policies.spec import NetworkSpec, PassCounts
 
 
@@ -72,3 +73,22 @@ class SparseTD3Policy(SparseCriticsMixin, TD3Policy):
 
 
 SparseTD3MlpPolicy, SparseTD3CnnPolicy, SparseTD3MultiInputPolicy = variants_of(SparseTD3Policy)
+
+
+class SimbaTD3Actor(SimbaActingModule, SparseTD3Actor):
+    """Actor of TD3 and DDPG that is a SimBa network."""
+
+
+@register_variant(SparseTD3Policy, "Simba")
+class SparseTD3SimbaPolicy(SimbaPolicy, SparseTD3Policy):
+    """Sparse SimBa networks for TD3 and DDPG.
+
+    Example::
+
+        from sb3_sparse import TD3
+
+        model = TD3("SparseSimbaPolicy", "Pendulum-v1", policy_kwargs=dict(sparsity=0.8))
+    """
+
+    actor_class = SimbaTD3Actor
+    critic_class = SimbaContinuousCritic

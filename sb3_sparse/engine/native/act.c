@@ -1,6 +1,8 @@
 /* Networks that act: a few observations through all layers in one call, nothing kept. */
 #include "activations.h"
 
+#include <math.h>
+
 /* The first `left` of WIDTH elements, the rest 0. */
 INLINE vec first(const float *from, int64_t left) {
 #if WIDTH == 16
@@ -119,13 +121,36 @@ static void several(const step_t *step, int64_t batch, const float *x, float *y)
     }
 }
 
+/* LayerNorm of each of `lanes` inputs, whose features are `lanes` apart. */
+static void normalise(const step_t *step, int64_t lanes, const float *x, float *y) {
+    int64_t n = step->columns;
+    for (int64_t e = 0; e < lanes; e++) {
+        double sum = 0, squares = 0;
+        for (int64_t k = 0; k < n; k++) sum += x[k * lanes + e];
+        float mean = (float)(sum / (double)n);
+        for (int64_t k = 0; k < n; k++) {
+            float d = x[k * lanes + e] - mean;
+            squares += (double)d * d;
+        }
+        float factor = (float)(1 / sqrt(squares / (double)n + step->epsilon));
+        for (int64_t k = 0; k < n; k++) {
+            float z = (x[k * lanes + e] - mean) * factor;
+            if (step->scale) z *= step->scale[k];
+            y[k * lanes + e] = step->shift ? z + step->shift[k] : z;
+        }
+    }
+}
+
 static int64_t padded(int64_t features) { return (features + LANES - 1) / LANES * LANES; }
 
 int NAMED(act, SUFFIX)(const step_t *steps, int64_t count, int64_t batch, int doubles,
                        const void *x, float *y) {
     int64_t lanes = batch == 1 ? 1 : LANES, numbers = doubles ? batch * steps->columns : 0;
     int64_t size = batch == 1 ? 0 : steps->columns;
-    for (int64_t s = 0; s < count; s++) size += padded(steps[s].rows);
+    for (int64_t s = 0; s < count; s++) {
+        size += padded(steps[s].rows);
+        if (steps[s].epsilon >= 0) size += padded(steps[s].columns);
+    }
     size = padded(size * lanes) + padded(numbers);
     float *place[MOST_STEPS], *next = sb3_sparse_scratch((size_t)size * 4);
     if (!next) return -1;
@@ -144,6 +169,11 @@ int NAMED(act, SUFFIX)(const step_t *steps, int64_t count, int64_t batch, int do
     for (int64_t s = 0; s < count; s++) {
         const step_t *step = steps + s;
         const float *from = step->from < 0 ? input : place[step->from];
+        if (step->epsilon >= 0) {
+            normalise(step, lanes, from, next);
+            from = next;
+            next += padded(step->columns) * lanes;
+        }
         place[s] = next;
         next += padded(step->rows) * lanes;
         if (batch == 1)
@@ -151,6 +181,10 @@ int NAMED(act, SUFFIX)(const step_t *steps, int64_t count, int64_t batch, int do
         else
             several(step, batch, from, place[s]);
         activate(step->activation, (float)step->a, (float)step->b, place[s], step->rows * lanes);
+        if (step->add > -2) {
+            const float *shortcut = step->add < 0 ? input : place[step->add];
+            for (int64_t i = 0; i < step->rows * lanes; i++) place[s][i] += shortcut[i];
+        }
         if (step->out < 0) continue;
         float *to = y + step->out * batch;
         if (batch == 1)
