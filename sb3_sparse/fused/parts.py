@@ -1,4 +1,4 @@
-"""Networks as a program takes them: linear layers, each with its activation."""
+"""Networks as a program takes them: linear layers and what surrounds each."""
 
 from __future__ import annotations
 
@@ -14,7 +14,10 @@ KNOWN_MODULES = (nn.Linear, SparseLinear, nn.LayerNorm, nn.Identity, *ACTIVATION
 
 
 def parts(*modules: nn.Module) -> Parts:
-    """Split a network into linear layers and activations, for ``program.network``.
+    """Split a network into linear layers and what surrounds them, for ``program.network``.
+
+    Each layer may have a LayerNorm before it and an activation behind it; residual blocks add the
+    result of an earlier layer.
 
     Example::
 
@@ -27,7 +30,10 @@ def parts(*modules: nn.Module) -> Parts:
     """
     found = parts_of(modules)
     if found is None:
-        inner = (m for module in modules for m in module.modules() if not list(m.children()))
-        others = {type(m).__name__ for m in inner if type(m) not in KNOWN_MODULES}
-        raise NotCovered(f"a network with {', '.join(sorted(others)) or 'modules of its own'}")
+        leaves = [m for module in modules for m in module.modules() if not [*m.children()]]
+        others = {type(m).__name__ for m in leaves if type(m) not in KNOWN_MODULES}
+        if others:
+            raise NotCovered(f"a network with {', '.join(sorted(others))}")
+        order = ", ".join(type(m).__name__ for m in leaves)
+        raise NotCovered(f"a network of {order} in this order")
     return found

@@ -25,7 +25,8 @@ def with_simba(perceptron: nn.Sequential, hidden: int) -> nn.Sequential:
     layers: list[Any] = list(perceptron)
     widths = [layers[2 * i].out_features for i in range(hidden)]
     activation = type(layers[1]) if hidden else nn.ReLU
-    network = simba(layers[0].in_features, widths, activation)
+    inputs = layers[0].in_features if hidden else 0
+    network = simba(inputs, widths, activation)
     head = nn.Sequential(*layers[2 * hidden :])
     initialise(head)
     return nn.Sequential(*network, *head)

@@ -6,6 +6,7 @@ Without torch, so that every buffer is NumPy's own and the address sanitizer wat
 from __future__ import annotations
 
 import ctypes
+import struct
 import sys
 
 import numpy as np
@@ -78,6 +79,13 @@ def one_act(lib, random, widths: list[int], batch: int, broken: bool):
         steps += [rows, columns, *places, address(values), address(mask), address(bias)]
         source = number - 1 - (number == len(widths) - 1)
         steps += [int(random.integers(15)), 0, 0, source, total if head else -1]
+        norm = random.random() < 0.5
+        affine = [buffer(columns) if norm and random.random() < 0.5 else None for _ in range(2)]
+        kept.append(affine)
+        epsilon = struct.unpack("q", struct.pack("d", 1e-6 if norm else -1.0))[0]
+        alike = [n for n, w in enumerate(widths[: number + 1], -1) if w == rows] if not head else []
+        added = int(random.choice(alike)) if alike and random.random() < 0.7 else -2
+        steps += [epsilon, *map(address, affine), added]
         total += rows if head else 0
     packed = (ctypes.c_int64 * len(steps))(*steps)
     doubles = int(random.integers(2))
