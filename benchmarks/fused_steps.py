@@ -28,11 +28,12 @@ import sb3_sparse
 
 
 class Case(NamedTuple):
-    """A case: algorithm, width of its two layers, batch size."""
+    """A case: algorithm, width of its two layers or blocks, batch size."""
 
     algorithm: str
     width: int
     batch: int
+    policy: str = "SparsePolicy"
 
 
 CASES = {
@@ -41,6 +42,8 @@ CASES = {
     "TD3 256": Case("TD3", 256, 256),
     "DQN 512": Case("DQN", 512, 128),
     "PPO 64": Case("PPO", 64, 64),
+    "SimBa SAC 128": Case("SAC", 128, 256, "SparseSimbaPolicy"),
+    "SimBa SAC 256": Case("SAC", 256, 256, "SparseSimbaPolicy"),
 }
 SPARSITIES = [0.0, 0.9, 0.95]
 STEPS = 20
@@ -50,19 +53,23 @@ STEPS = 20
 def make(package: Any, case: Case, sparsity: float | None) -> Any:
     """Make a model; give a function that takes gradient steps, and their number too.
 
-    :param sparsity: None: SB3's own policy
+    :param sparsity: None: SB3's own policy, or a dense SimBa network in SB3's own steps
     """
     algorithm = getattr(package, case.algorithm)
     actions = spaces.Discrete(4) if case.algorithm == "DQN" else TORQUES
     env: gym.Env = RandomEnv(VECTOR, actions)
-    widths = [case.width, case.width]
+    widths: Any = [case.width, case.width]
+    if case.policy == "SparseSimbaPolicy":
+        widths = {"pi": [case.width // 2], "qf": widths}
     if case.algorithm == "PPO":
         maker = on_policy(algorithm, env, case.batch, case.batch * STEPS, net_arch=widths)
     else:
         maker = off_policy(algorithm, env, case.batch, STEPS, net_arch=widths)
-    if sparsity is None:
+    if sparsity is not None:
+        return maker(case.policy, {"sparsity": sparsity})
+    if case.policy == "SparsePolicy":
         return maker("MlpPolicy", {})
-    return maker("SparsePolicy", {"sparsity": sparsity})
+    return maker(case.policy, {"sparsity": 0.0})  # SB3 has no such policy
 
 
 def time_case(case: Case, sparsity: float, rounds: int) -> dict[str, dict[str, float]]:

@@ -207,6 +207,14 @@ def test_the_measures_of_the_documents_run(tmp_path, monkeypatch, capsys):
     }
 
 
+def test_the_example_of_simba_trains_a_sparse_network():
+    (code,) = python_blocks("docs/simba.md")
+    names: dict[str, Any] = {}
+    exec(compile(code, "docs/simba.md", "exec"), names)
+    assert names["model"].why_not_fused() is None
+    assert_masked(names["model"])
+
+
 @pytest.mark.parametrize("path", ["README.md", *(f"docs/{p.name}" for p in ROOT.glob("docs/*.md"))])
 def test_links_lead_somewhere(path):
     text = (ROOT / path).read_text()

@@ -63,6 +63,8 @@ UNARY = {
     "negative": (lambda v: -v, lambda t: -t),
     "part": (lambda v: v[0:1] + v[1:3], lambda t: t[..., 0:1] + t[..., 1:3]),
     "over one": (lambda v: 1.0 - v * 2.0, lambda t: 1.0 - t * 2.0),
+    "layer norm": (lambda v: v.layer_norm(0.1), lambda t: th.nn.functional.layer_norm(
+        t, t.shape[-1:], eps=0.1)),
 }  # fmt: skip
 BINARY = {
     "add": (lambda a, b: a + b, lambda a, b: a + b),
