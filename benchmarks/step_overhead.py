@@ -111,11 +111,11 @@ def time_topology_update(width: int, interval: int) -> tuple[float, float]:
     start = time.perf_counter()
     train()
     step = (time.perf_counter() - start) / steps
-    plan = SparsityCallback("rigl", update_interval=1, drop_fraction=0.5).plan
+    plans = SparsityCallback("rigl", update_interval=1, drop_fraction=0.5).plans
     sparse = model.policy.sparse
     moving = []
     for _ in range(3):
-        sparse.start(plan, soft_targets=False, in_force=lambda: True)
+        sparse.start(plans, soft_targets=False, in_force=lambda: True)
         updates = sparse.networks[0].mask_updates
         start = time.perf_counter()
         train()

@@ -18,7 +18,7 @@ import sb3_sparse.algorithms
 NAMES = ("SAC", "TD3", "DDPG", "DQN", "PPO", "A2C")
 assert set(NAMES) == set(sb3_sparse.algorithms.__all__)
 OFF_POLICY = ("SAC", "TD3", "DDPG", "DQN")
-METHODS = ("static", "set", "rigl", "prune", "dense")
+METHODS = ("static", "set", "rigl", "prune", "granet", "dense")
 STORAGES = ("masked", "sparse", "auto")
 BOX = spaces.Box(-1.0, 1.0, (3,))
 VECTOR = spaces.Box(-1.0, 1.0, (5,))
@@ -99,7 +99,7 @@ def policy_kwargs_of(method: str, storage: str = "masked") -> dict[str, Any]:
     found: dict[str, Any] = {"compute": storage, "sparsity": 0.7}
     if method == "dense":
         found["sparsity"] = 0.0
-    if method == "prune":
+    if method in ("prune", "granet"):
         found["initial_sparsity"] = 0.2
     return found
 

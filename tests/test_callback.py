@@ -242,7 +242,7 @@ def test_two_callbacks_at_once_are_refused_and_an_interrupted_run_can_go_on():
     with pytest.raises(ConfigError, match="two SparsityCallbacks"):
         model.learn(30, callback=[SparsityCallback("set"), SparsityCallback("rigl")])
     model.learn(30, callback=SparsityCallback("set"))
-    assert model.policy.sparse.plan is None
+    assert not model.policy.sparse.has_plans
 
 
 def test_after_an_interrupted_run_masks_stand_still_without_a_callback():
@@ -294,12 +294,16 @@ def test_training_on_after_the_last_update_says_nothing(recwarn):
 
 def test_help_shows_the_defaults_and_a_method_leaves_alone_what_it_does_not_take():
     shown = str(inspect.signature(SparsityCallback))
-    for default in ("update_interval: 'int' = 1000", "drop_fraction: 'float' = 0.5", "= 0.8"):
+    for default in (
+        "update_interval: 'int | Mapping[str, int]' = 1000",
+        "drop_fraction: 'float | Mapping[str, float]' = 0.5",
+        "= 0.8",
+    ):
         assert default in shown
     assert '0.2 for ``"prune"``' in (SparsityCallback.__doc__ or "")
-    assert SparsityCallback("prune").plan.begin == 0.2
-    assert SparsityCallback("rigl").plan.begin == 0.0
-    assert SparsityCallback("prune", begin=0.0).plan.begin == 0.0
+    assert SparsityCallback("prune").plans["net"].begin == 0.2
+    assert SparsityCallback("rigl").plans["net"].begin == 0.0
+    assert SparsityCallback("prune", begin=0.0).plans["net"].begin == 0.0
 
 
 def test_learning_for_no_steps_is_allowed_as_in_sb3():

@@ -95,8 +95,17 @@ def test_the_example_of_the_readme_runs(capsys):
     assert "sparsity: actor 0.9" in capsys.readouterr().out
 
 
+def test_the_methods_by_network_of_the_documents_train():
+    code, _ = python_blocks("docs/methods.md")
+    names: dict[str, object] = {}
+    exec(compile(code, "docs/methods.md", "exec"), names)
+    model: Any = names["model"]
+    with pytest.warns(UserWarning, match=r"'rigl' had no mask update.*500th gradient step"):
+        model.learn(110, callback=names["callback"])  # ten gradient steps
+
+
 def test_the_method_of_the_documents_trains():
-    (code,) = python_blocks("docs/methods.md")
+    _, code = python_blocks("docs/methods.md")
     names: dict[str, object] = {"__name__": "docs"}
     try:
         exec(compile(code, "docs/methods.md", "exec"), names)

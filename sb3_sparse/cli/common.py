@@ -47,7 +47,13 @@ GymPackages = Annotated[
         shown=False,
     ),
 ]
-Method = Annotated[str | None, option("dense, prune, static, set or rigl.", shown="rigl")]
+Method = Annotated[
+    str | None,
+    option(
+        "dense, prune, static, set, rigl, granet, actor=static,critic=rigl, or a preset (mst).",
+        shown="rigl",
+    ),
+]
 Sparsity = Annotated[float | None, option("Removed fraction, in [0, 1).", shown=AS_CONFIG)]
 Distribution = Annotated[str | None, option("erk, er or uniform.", shown="erk")]
 Steps = Annotated[int | None, option("Environment steps.", "--n-timesteps", "-n", shown=AS_CONFIG)]

@@ -17,6 +17,7 @@ from sb3_sparse.engine.hooks import Hooks
 from sb3_sparse.engine.network import SparseNetwork
 from sb3_sparse.engine.optimizers import acts_elementwise, add_weight_decay, keep_implementation
 from sb3_sparse.engine.plan import Plan, warn_of_no_plan
+from sb3_sparse.engine.plans import Plans
 from sb3_sparse.engine.sequential import chain_up
 from sb3_sparse.engine.storage import LayerStorage, check_masked, save_moments
 
@@ -28,7 +29,7 @@ class Controller:
     another hook advances the clocks of the networks that it owns and moves their masks where an
     update is due; the step then uses gradients under the new mask.
 
-    Copies and pickles of a controller have no plan, and no hooks until :meth:`attach` is called.
+    Copies and pickles of a controller have no plans, and no hooks until :meth:`attach` is called.
 
     :param networks: the sparse networks
     :param seed: mask seed, not negative
@@ -50,11 +51,8 @@ class Controller:
         self.weight_decay = weight_decay
         self.functional_gradients = functional_gradients
         self._auto = auto
-        self.plan: Plan | None = None
         self._in_force: Callable[[], bool] = bool
         self.progress = 0.0
-        self.updates_due = 0
-        """Updates due since the plan was made, over all networks."""
         self.soft_targets = False
         """Whether targets follow a mask at once."""
         self._gradient_hooks, self._optimizer_hooks = Hooks(), Hooks()
@@ -62,7 +60,7 @@ class Controller:
         self._warned = self._dense
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "plan": None, "_in_force": bool}
+        return {**self.__dict__, "_in_force": bool}
 
     @property
     def layers(self) -> Iterable[LayerStorage]:
@@ -73,6 +71,11 @@ class Controller:
     def sparsity(self) -> float:
         """Currently removed fraction of all connections within the budgets."""
         return 1.0 - sum(n.nnz for n in self.networks) / sum(n.size for n in self.networks)
+
+    @property
+    def has_plans(self) -> bool:
+        """Whether a training has started to move masks, and has not ended."""
+        return any(network.plan is not None for network in self.networks)
 
     @property
     def optimizers(self) -> list[th.optim.Optimizer]:
@@ -164,7 +167,7 @@ class Controller:
         self.attach()
         self.choose_storage(root)
         if not self._in_force():
-            self.plan = None  # left from an interrupted training
+            self.drop_plans()  # left from an interrupted training
         for layer in _sparse_layers(self.networks):
             if layer.gradient_mask is not None:
                 layer.gradient_mask.dense_grad = None
@@ -181,18 +184,16 @@ class Controller:
         for layer in _sparse_layers(self.networks):
             layer.remask_if_written()
 
-    def start(self, plan: Plan, soft_targets: bool, in_force: Callable[[], bool]) -> None:
+    def start(self, plans: Plans, soft_targets: bool, in_force: Callable[[], bool]) -> None:
         """Start moving masks.
 
-        :param plan: the schedule
+        :param plans: the plan of each network
         :param soft_targets: whether targets follow the mask at once (Polyak averaging), or at the
             next hard copy
-        :param in_force: tells whether the training that the plan was made for is still running
+        :param in_force: tells whether the training that the plans were made for is still running
         """
-        self.plan = plan
-        self.updates_due = 0
         for network in self.networks:
-            network.pending = None  # left from an interrupted training
+            network.start(plans[network.name])
         self._in_force = in_force
         self.soft_targets = soft_targets
 
@@ -200,21 +201,26 @@ class Controller:
         """Carry out the updates that are still due, and freeze the masks."""
         self.flush()
         for network in self.networks:
-            if self.plan is not None and network.must_finish(self.plan, self.progress):
-                self._move(network, self.plan, {})
-        self.plan = None
+            if network.must_finish(self.progress):
+                self._move(network, {})
+        self.drop_plans()
+
+    def drop_plans(self) -> None:
+        """Freeze the masks as they are."""
+        for network in self.networks:
+            network.plan = None
 
     def flush(self) -> None:
         """Carry out updates that have waited for the end of the rollout."""
         for network in self.networks:
-            if network.pending is not None and self.plan is not None:
-                self._move(network, self.plan, network.pending)
+            if network.pending is not None and network.plan is not None:
+                self._move(network, network.pending)
             network.pending = None
 
     def _capturing(self, network: SparseNetwork) -> bool:
         if self.functional_gradients:  # a rollout's actor gradient comes before its steps
-            return self.plan is not None and self.plan.wants_gradients
-        return network.wants_gradients(self.plan, self.progress)
+            return network.plan is not None and network.plan.wants_gradients
+        return network.wants_gradients(self.progress)
 
     def _before_step(self, optimizer: th.optim.Optimizer, args: object, kwargs: object) -> None:
         if not self._dense:
@@ -222,14 +228,14 @@ class Controller:
             self._settle_moments(optimizer)
         for network in self._owned_by(optimizer):
             network.clock += 1
-            if self.plan is None and not self._warned and network.denser:
+            if network.plan is None and not self._warned and network.denser:
                 self._warned = True
                 warn_of_no_plan(self.sparsity)
             for layer in network.sparse_layers:
                 layer.remask_if_written()
                 layer.mask_gradient()  # which others may have written after our hooks
-            if self.plan is not None:
-                self._update_if_due(network, self.plan)
+            if network.plan is not None:
+                self._update_if_due(network, network.plan)
             if self.weight_decay:
                 add_weight_decay(network.weights, self.weight_decay)
 
@@ -246,8 +252,8 @@ class Controller:
     def needs_torch(self, optimizer: th.optim.Optimizer) -> bool:
         """Whether torch must take the optimizer's next step, e.g. because masks move at it."""
         return any(
-            network.due(self.plan, network.clock + 1, self.progress)
-            or (self.plan is None and not self._warned and network.denser)
+            network.due(network.clock + 1, self.progress)
+            or (network.plan is None and not self._warned and network.denser)
             or any(layer.moments_stale for layer in network.layers)
             for network in self._owned_by(optimizer)
         )
@@ -255,7 +261,7 @@ class Controller:
     def wants_gradients(self, optimizer: th.optim.Optimizer) -> bool:
         """Whether the optimizer's next step needs dense gradients."""
         owned = self._owned_by(optimizer)
-        return any(network.wants_gradients(self.plan, self.progress) for network in owned)
+        return any(network.wants_gradients(self.progress) for network in owned)
 
     def count_step(self, optimizer: th.optim.Optimizer) -> None:
         """Count a step that was taken in the optimizer's place."""
@@ -264,11 +270,11 @@ class Controller:
 
     def _update_if_due(self, network: SparseNetwork, plan: Plan) -> None:
         gradients = network.take_gradients()
-        if network.due(plan, network.clock, self.progress):
-            self.updates_due += 1
+        if network.due(network.clock, self.progress):
+            network.updates_due += 1
             computed = {name: None if g is None else g() for name, g in gradients.items()}
             if plan.update_on == "step":
-                self._move(network, plan, computed)
+                self._move(network, computed)
             else:
                 network.pending = computed
 
@@ -284,12 +290,8 @@ class Controller:
     def _saved_form(self, optimizer: th.optim.Optimizer, state_dict: dict[str, Any]) -> None:
         save_moments(optimizer, state_dict, self.layers)
 
-    def _move(
-        self, network: SparseNetwork, plan: Plan, gradients: dict[str, th.Tensor | None]
-    ) -> None:
-        update = plan.update_at(network.clock, self.progress, self.seed)
-        at_once = plan.update_on == "step"
-        network.move(plan.topology, update, gradients, self.optimizers, self.soft_targets, at_once)
+    def _move(self, network: SparseNetwork, gradients: dict[str, th.Tensor | None]) -> None:
+        network.move(gradients, self.progress, self.seed, self.optimizers, self.soft_targets)
 
 
 def _sparse_layers(networks: Iterable[SparseNetwork]) -> Iterable[LayerStorage]:

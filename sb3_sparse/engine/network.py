@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Container, Mapping, Sequence
+from typing import Any
 
 import torch as th
 from torch import nn
@@ -15,7 +16,6 @@ from sb3_sparse.engine.sparse import SparseStorage, to_sparse
 from sb3_sparse.engine.storage import LayerStorage
 from sb3_sparse.sparsity.distributions import active_counts
 from sb3_sparse.sparsity.initialisation import random_mask, sparsity_aware_weights
-from sb3_sparse.topology import MaskUpdate, TopologyMethod
 
 
 class SparseNetwork:
@@ -40,6 +40,10 @@ class SparseNetwork:
             MaskedStorage(layer_name, module) for layer_name, module in prunable
         ]
         self.dense_layers = list(dense_layers)
+        self.plan: Plan | None = None
+        """When masks move, and how; None: they do not, and no callback watches over them."""
+        self.updates_due = 0
+        """Updates due since the plan was made."""
         self.clock = 0
         """Gradient steps begun by the owning optimizer."""
         self.mask_updates = 0
@@ -48,6 +52,9 @@ class SparseNetwork:
         """Share of the active connections that the last update dropped."""
         self.pending: dict[str, th.Tensor | None] | None = None
         """Dense gradients of an update that waits for the end of the rollout, by layer name."""
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "plan": None}  # a copy is trained by nobody yet
 
     @property
     def optimizer(self) -> th.optim.Optimizer:
@@ -138,25 +145,38 @@ class SparseNetwork:
             for layer in self.layers
         ]
 
-    def due(self, plan: Plan | None, step: int, progress: float) -> bool:
+    def start(self, plan: Plan) -> None:
+        """Start moving masks by a plan."""
+        self.plan = plan
+        self.updates_due = 0
+        self.pending = None  # left from an interrupted training
+
+    def due(self, step: int, progress: float) -> bool:
         """Whether masks move at that gradient step.
 
-        :param plan: None: they never move
         :param step: gradient step of the owning optimizer, from 1
         :param progress: environment steps done / planned
         """
-        return plan is not None and (plan.due(step, progress) or self.must_finish(plan, progress))
+        plan = self.plan
+        return plan is not None and (plan.due(step, progress) or self.must_finish(progress))
 
-    def must_finish(self, plan: Plan, progress: float) -> bool:
-        """Whether a plan has ended while the network is still too dense."""
-        return plan.topology.reaches_final and progress >= plan.end and self.denser
+    def must_finish(self, progress: float) -> bool:
+        """Whether the plan has ended while the network is still too dense."""
+        plan = self.plan
+        return (
+            plan is not None
+            and plan.topology.reaches_final
+            and progress >= plan.end
+            and self.denser
+        )
 
-    def wants_gradients(self, plan: Plan | None, progress: float) -> bool:
+    def wants_gradients(self, progress: float) -> bool:
         """Whether the next gradient step needs dense gradients."""
+        plan = self.plan
         return (
             plan is not None
             and plan.wants_gradients
-            and ((self.clock + 1) % plan.update_interval == 0 or self.must_finish(plan, progress))
+            and ((self.clock + 1) % plan.update_interval == 0 or self.must_finish(progress))
         )
 
     def take_gradients(self) -> dict[str, DenseGradient | None]:
@@ -166,33 +186,35 @@ class SparseNetwork:
 
     def move(
         self,
-        method: TopologyMethod,
-        update: MaskUpdate,
         gradients: Mapping[str, th.Tensor | None],
+        progress: float,
+        seed: int,
         optimizers: Sequence[th.optim.Optimizer],
         soft_targets: bool,
-        at_once: bool,
     ) -> None:
-        """Move the masks of all trained layers.
+        """Move the masks of all trained layers by the plan.
 
-        :param method: chooses the exchange
-        :param update: time and extent of the update
         :param gradients: dense gradients by layer name
+        :param progress: environment steps done / planned
+        :param seed: mask seed
         :param optimizers: optimizers whose moments follow
         :param soft_targets: whether targets follow at once
-        :param at_once: whether the gradients are those of the next step
         """
+        assert self.plan is not None
+        method, at_once = self.plan.topology, self.plan.update_on == "step"
+        update = self.plan.update_at(self.clock, progress, seed)
         nnz = self.nnz
+        last = method.reaches_final and update.progress >= update.end  # nothing grows any more
         dropped = grown = 0
         for layer in self.layers:
             if layer.frozen:
                 continue
             gradient = gradients.get(layer.name)
             dense_grad = None
-            if method.needs_gradient:
-                if gradient is None:
-                    continue
+            if method.needs_gradient and gradient is not None:
                 dense_grad = gradient.detach().cpu().numpy().ravel()
+            elif method.needs_gradient and not last:
+                continue
             exchange = method.exchange(layer, update, dense_grad=dense_grad)
             if not exchange:
                 continue

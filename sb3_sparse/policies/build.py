@@ -62,14 +62,14 @@ def build_networks(
                 f"{name!r}"
             )
     sparsities = config.by_network(sizes)
-    if config.sparsity_aware_init and config.initial_sparsity != 0.0:
-        _warn_of_redrawn(policy, modules, networks)
+    starts = {name: config.initial(name, final) for name, final in sparsities.items()}
+    if config.sparsity_aware_init:
+        _warn_of_redrawn(policy, modules, [n for n in networks if starts[n.name] != 0.0])
     for network in networks:
-        sparsity = sparsities[network.name]
         gains = {layer.name: gain(layer.name) for layer in network.layers}
         network.initialise(
-            sparsity,
-            config.initial(network.name, sparsity),
+            sparsities[network.name],
+            starts[network.name],
             config.distribution,
             seed,
             gains if config.sparsity_aware_init else None,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -31,7 +31,8 @@ class SparsityConfig:
 
     :param sparsity: removed fraction of the weights, in [0, 1), for every network, or one for each
         network by name, e.g. ``{"actor": 0.95, "critic": 0.8}``; required
-    :param initial_sparsity: sparsity at the start of training, e.g. 0.0 for pruning; None: the same
+    :param initial_sparsity: sparsity at the start of training, e.g. 0.0 for pruning, of every
+        network, or by network; None, or a network left out: as sparse as at the end
     :param distribution: ``"erk"``, ``"er"`` or ``"uniform"``
     :param actor_share: fraction of all remaining connections that the actor gets (all critics
         counted); None: actor and critic equally sparse
@@ -49,7 +50,7 @@ class SparsityConfig:
     """
 
     sparsity: float | Mapping[str, float] | None
-    initial_sparsity: float | None = None
+    initial_sparsity: float | Mapping[str, float | None] | None = None
     distribution: str = "erk"
     actor_share: float | None = None
     dense_layers: Sequence[str] = ()
@@ -71,8 +72,10 @@ class SparsityConfig:
                 )
         else:
             check_sparsity(self.sparsity)
-        if self.initial_sparsity is not None:
-            check_sparsity(self.initial_sparsity, "initial_sparsity")
+        for name, start in self._starts().items():
+            if start is not None:
+                of = f"initial_sparsity of {name!r}" if name else "initial_sparsity"
+                check_sparsity(start, of)
         check_distribution(self.distribution)
         check_weight_decay(self.weight_decay, None)
         if not isinstance(self.dense_layers, (list, tuple)) or not all(
@@ -97,6 +100,11 @@ class SparsityConfig:
         if self.compute == "sparse":
             library()
 
+    def _starts(self) -> Mapping[str, float | None]:
+        """The sparsity at the start by network; of all networks by the name ""."""
+        given = self.initial_sparsity
+        return given if isinstance(given, Mapping) else {"": given}
+
     @classmethod
     def pop_from(cls, kwargs: dict[str, Any]) -> SparsityConfig:
         """Make a config of the keyword arguments that are its fields, and remove these."""
@@ -111,6 +119,25 @@ class SparsityConfig:
         generator.set_state(th.get_rng_state())
         return int(th.randint(2**63 - 1, (), generator=generator))
 
+    def check_names(self, networks: Collection[str]) -> None:
+        """Check that the names in ``sparsity`` and ``initial_sparsity`` are those of networks.
+
+        :param networks: names of all networks of the policy
+        :raises ConfigError: if they are not
+        """
+        names = ", ".join(map(repr, networks))
+        if isinstance(self.sparsity, Mapping) and set(self.sparsity) != set(networks):
+            raise ConfigError(
+                f"sparsity is given for {', '.join(repr(n) for n in self.sparsity)}; this "
+                f"policy has the networks {names}: name each of them, or give one number"
+            )
+        unknown = [repr(name) for name in self._starts() if name and name not in networks]
+        if unknown:
+            raise ConfigError(
+                f"initial_sparsity is given for {', '.join(unknown)}; this policy has the networks "
+                f"{names}"
+            )
+
     def by_network(self, sizes: Mapping[str, int]) -> dict[str, float]:
         """The sparsity of each network.
 
@@ -118,17 +145,13 @@ class SparsityConfig:
         :raises ConfigError: if names do not match or a share is infeasible
         """
         assert self.sparsity is not None
-        names = ", ".join(repr(name) for name in sizes)
+        self.check_names(sizes)
         if isinstance(self.sparsity, Mapping):
-            if set(self.sparsity) != set(sizes):
-                raise ConfigError(
-                    f"sparsity is given for {', '.join(repr(n) for n in self.sparsity)}; this "
-                    f"policy has the networks {names}: name each of them, or give one number"
-                )
             return {name: check_sparsity(self.sparsity[name]) for name in sizes}
         if self.actor_share is None:
             return {name: check_sparsity(self.sparsity) for name in sizes}
         if set(sizes) != {"actor", "critic"}:
+            names = ", ".join(map(repr, sizes))
             raise ConfigError(f"actor_share needs an actor and a critic; this policy has {names}")
         actor, critic = split_sparsity(
             sizes["actor"], sizes["critic"], self.sparsity, self.actor_share
@@ -141,11 +164,13 @@ class SparsityConfig:
         :param final: the sparsity that it ends with
         :raises ConfigError: if it would start sparser than it ends
         """
-        if self.initial_sparsity is None:
+        starts = self._starts()
+        start = starts.get(network, starts.get(""))
+        if start is None:
             return final
-        if self.initial_sparsity > final:
+        if start > final:
             raise ConfigError(
-                f"initial_sparsity={self.initial_sparsity} is above the sparsity {final} of "
+                f"initial_sparsity={start} is above the sparsity {final} of "
                 f"{network!r}; pruning only removes, so start at or below it (0.0 is dense)"
             )
-        return check_sparsity(self.initial_sparsity)
+        return check_sparsity(start)

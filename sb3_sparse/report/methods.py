@@ -13,6 +13,8 @@ NAMES = {
     "static": "Static",
     "set": "SET",
     "rigl": "RigL",
+    "granet": "GraNet",
+    "mst": "MST",
 }
 
 
@@ -25,8 +27,8 @@ class Look:
     line: Any
 
 
-# Colours and markers are the paper's (IBM's colour-blind-safe palette). Line styles are added, so
-# that no line is told by its colour alone.
+# Colours and markers are the paper's (IBM's colour-blind-safe palette) for what it compares. Line
+# styles are added, so that no line is told by its colour alone.
 LOOKS = {
     DENSE: Look("#444444", "X", "--"),
     EQUAL: Look("#648FFF", "s", "-."),
@@ -34,6 +36,8 @@ LOOKS = {
     "static": Look("#FFB000", ">", (0, (5, 1))),
     "set": Look("#FE6100", "<", "--"),
     "rigl": Look("#362682", "o", "-"),
+    "granet": Look("#117733", "^", "-."),
+    "mst": Look("#882255", "v", "--"),
 }
 OTHERS = (Look("#009E73", "^", "-"), Look("#56B4E9", "v", "--"), Look("#7F7F7F", "P", ":"))
 # For levels of sparsity, budgets and regimes, from much to little; distinct in grey, too.
@@ -62,7 +66,7 @@ def shaded(label: str, place: int) -> Look:
 
 
 def in_order(labels: set[str]) -> list[str]:
-    """Sort methods: dense, then those of the paper in its order, then all others by name."""
+    """Sort methods: dense, those of the paper in its order, other shipped ones, then by name."""
     known = [label for label in NAMES if label in labels]
     return known + sorted(labels - set(known))
 

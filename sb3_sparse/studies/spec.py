@@ -194,9 +194,8 @@ def _check_choices(blocks: Sequence[Mapping[str, Any]], scale: Mapping[str, Any]
 def _with_schedule(arguments: dict[str, Any], schedule: Mapping[str, Any]) -> dict[str, Any]:
     """Add the entries of a scale's ``schedule`` that the method takes: none for static masks."""
     run = RunSpec(**arguments)
-    callback = run.settings().callback if schedule else None
-    if callback is None:
+    methods = run.settings().methods if schedule else None
+    if methods is None:
         return arguments
-    options = method_named(callback["method"]).options
-    taken = {name: value for name, value in schedule.items() if name in options}
+    taken = {name: value for name, value in schedule.items() if name in methods.options}
     return {**arguments, "hyperparams": {**taken, **run.hyperparams}}

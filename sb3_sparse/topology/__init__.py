@@ -1,6 +1,6 @@
 """How masks move: one file and one registration for each method."""
 
-from sb3_sparse.topology import prune, rigl, set, static  # noqa: A004, F401  (they register)
+from sb3_sparse.topology import granet, prune, rigl, set, static  # noqa: A004, F401
 from sb3_sparse.topology.base import (
     NOTHING,
     Array,
@@ -10,6 +10,7 @@ from sb3_sparse.topology.base import (
     MaskUpdate,
     TopologyMethod,
 )
+from sb3_sparse.topology.methods import Methods
 from sb3_sparse.topology.registry import method_named, method_names, register
 
 __all__ = [
@@ -19,6 +20,7 @@ __all__ = [
     "Exchange",
     "Layer",
     "MaskUpdate",
+    "Methods",
     "TopologyMethod",
     "method_named",
     "method_names",

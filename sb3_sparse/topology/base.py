@@ -100,7 +100,7 @@ class TopologyMethod(ABC):
     """Base class of methods that move masks. Put ``@register`` on each subclass.
 
     A method holds no state: :meth:`exchange` receives everything that it may depend on. Use
-    :class:`DropGrow` for methods that drop and grow equally many connections.
+    :class:`DropGrow` for methods that drop by magnitude and grow by a score.
 
     Example::
 
@@ -130,6 +130,15 @@ class TopologyMethod(ABC):
     """Whether connections may be gained."""
     reaches_final: ClassVar[bool] = False
     """Whether the method prunes a policy that starts denser to the requested sparsity."""
+    initial_share: ClassVar[float] = 0.0
+    """Where :attr:`reaches_final`: the share of the sparsity that training usually starts with."""
+
+    def initial_sparsity(self, sparsity: float) -> float:
+        """Return the sparsity that training usually starts with.
+
+        :param sparsity: the one that it ends with
+        """
+        return round(self.initial_share * sparsity, 9) if self.reaches_final else sparsity
 
     @abstractmethod
     def exchange(self, layer: Layer, update: MaskUpdate, *, dense_grad: Array | None) -> Exchange:
@@ -138,15 +147,16 @@ class TopologyMethod(ABC):
         :param layer: the layer, read only
         :param update: time and extent of the update
         :param dense_grad: gradient of the loss by every weight, active or not, shape ``(size,)``;
-            None unless :attr:`needs_gradient` is True
+            None unless :attr:`needs_gradient` is True, and at the last update of a method that
+            :attr:`reaches_final`, if training ends before another gradient arrives
         """
 
 
 class DropGrow(TopologyMethod):
-    """Drops the active connections of least magnitude and grows as many by a score.
+    """Drops the active connections of least magnitude and grows others by a score.
 
-    Candidates for growth are the inactive connections and those just dropped, so nnz never changes.
-    The number of exchanged connections follows the cosine schedule of the drop fraction.
+    Candidates for growth are the inactive connections and those just dropped. By default as many
+    grow as are dropped, so nnz never changes, and the drop fraction follows its cosine schedule.
 
     Example::
 
@@ -176,17 +186,29 @@ class DropGrow(TopologyMethod):
         :return: shape ``(len(candidates),)``
         """
 
-    def exchange(self, layer: Layer, update: MaskUpdate, *, dense_grad: Array | None) -> Exchange:
+    def counts(self, layer: Layer, update: MaskUpdate) -> tuple[int, int]:
+        """Return how many connections are dropped, and how many of the candidates then grow.
+
+        :param layer: the layer, read only
+        :param update: time and extent of the update
+        """
         fraction = cosine_drop_fraction(update.progress, update.drop_fraction, update.end)
         count = floor_count(fraction * layer.nnz)
-        if count == 0 or layer.nnz == layer.size:
+        return count, count
+
+    def exchange(self, layer: Layer, update: MaskUpdate, *, dense_grad: Array | None) -> Exchange:
+        drops, grows = self.counts(layer, update)
+        full = layer.nnz == layer.size
+        if drops == grows and (drops == 0 or full):  # a full layer can only regrow what it drops
             return NOTHING
         mask = layer.mask()
-        dropped = least_magnitude(layer.dense(), np.flatnonzero(mask), count)
+        dropped = least_magnitude(layer.dense(), np.flatnonzero(mask), drops)
         mask[dropped] = False
-        candidates = np.flatnonzero(~mask)
-        scores = self.scores(layer, update, candidates, dense_grad=dense_grad)
-        grown = candidates[largest(scores, count)]
+        grown = np.empty(0, dtype=np.int64)
+        if grows:
+            candidates = np.flatnonzero(~mask)
+            scores = self.scores(layer, update, candidates, dense_grad=dense_grad)
+            grown = candidates[largest(scores, min(grows, candidates.size))]
         return Exchange(
             dropped=np.setdiff1d(dropped, grown, assume_unique=True),
             grown=np.setdiff1d(grown, dropped, assume_unique=True),

@@ -45,8 +45,8 @@ class Definition:
 
     @property
     def method(self) -> str:
-        """The method that is tuned."""
-        return self.run.settings().method
+        """The method or preset that is tuned."""
+        return self.run.preset or self.run.settings().method
 
     @property
     def default_name(self) -> str:

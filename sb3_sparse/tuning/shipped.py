@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from sb3_sparse.sparsity.budgets import feasible_actor_share
-from sb3_sparse.topology import method_named
+from sb3_sparse.topology import Methods
 from sb3_sparse.tuning.backend import BaseDistribution
 from sb3_sparse.tuning.spaces import (
     CategoricalDistribution,
@@ -13,7 +13,7 @@ from sb3_sparse.tuning.spaces import (
     IntDistribution,
     Space,
 )
-from sb3_sparse.zoo.settings import DENSE
+from sb3_sparse.zoo.configs import DENSE
 
 WEIGHT_DECAY = (0.0, 1e-6, 1e-4, 1e-3)
 UPDATE_INTERVAL = (100, 250, 500, 1000, 5000)
@@ -25,7 +25,7 @@ ACTOR_SHARE = (0.05, 0.6)
 def paper_space(method: str) -> Space:
     """Return the paper's grid over the hyperparameters that a method has.
 
-    :param method: ``"dense"`` or a topology method
+    :param method: ``"dense"``, a topology method, or methods by network as in ``critic=rigl``
     :raises ConfigError: for an unknown method
 
     Source: arXiv:2206.10369, appendix "Hyper-parameter sweep".
@@ -33,12 +33,12 @@ def paper_space(method: str) -> Space:
     searched: dict[str, BaseDistribution] = {"weight_decay": CategoricalDistribution(WEIGHT_DECAY)}
     if method == DENSE:
         return Space("paper", searched)
-    topology = method_named(method)
-    if "update_interval" in topology.options:
+    methods = Methods.parse(method)
+    if "update_interval" in methods.options:
         searched["update_interval"] = CategoricalDistribution(UPDATE_INTERVAL)
-    if "drop_fraction" in topology.options:
+    if "drop_fraction" in methods.options:
         searched["drop_fraction"] = CategoricalDistribution(DROP_FRACTION)
-    if not topology.reaches_final:  # a dense start has no sparse initialisation
+    if not methods.start_dense:  # a dense start has no sparse initialisation
         searched["sparsity_aware_init"] = CategoricalDistribution(SPARSITY_AWARE_INIT)
     return Space("paper", searched)
 
@@ -46,7 +46,7 @@ def paper_space(method: str) -> Space:
 def wide_space(method: str, sizes: Mapping[str, int], sparsity: float | None) -> Space:
     """Return a continuous space around the paper's grid, for a method and a policy.
 
-    :param method: ``"dense"`` or a topology method
+    :param method: ``"dense"``, a topology method, or methods by network as in ``critic=rigl``
     :param sizes: connections of each network of the policy, were it dense, by name
     :param sparsity: sparsity of all networks together; None if each has its own, so that there is
         no common budget to share out
@@ -58,10 +58,10 @@ def wide_space(method: str, sizes: Mapping[str, int], sparsity: float | None) ->
     }
     if method == DENSE:
         return Space("wide", searched)
-    topology = method_named(method)
-    if "update_interval" in topology.options:
+    methods = Methods.parse(method)
+    if "update_interval" in methods.options:
         searched["update_interval"] = IntDistribution(50, 10_000, log=True)
-    if "drop_fraction" in topology.options:
+    if "drop_fraction" in methods.options:
         searched["drop_fraction"] = FloatDistribution(0.0, 0.5)
     searched["distribution"] = CategoricalDistribution(("erk", "uniform"))
     if sizes.keys() == {"actor", "critic"} and sparsity is not None:

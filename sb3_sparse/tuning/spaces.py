@@ -9,9 +9,9 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from sb3_sparse.errors import ConfigError
-from sb3_sparse.topology import method_named
+from sb3_sparse.topology import Methods
 from sb3_sparse.tuning.backend import BaseDistribution, Trial, optuna, quiet_optuna
-from sb3_sparse.zoo.settings import DENSE
+from sb3_sparse.zoo.configs import DENSE
 from sb3_sparse.zoo.spec import RunSpec
 
 CategoricalDistribution = optuna.distributions.CategoricalDistribution
@@ -231,7 +231,7 @@ def _check_names(space: Space, run: RunSpec, names: Set[str]) -> None:
     if method == DENSE:
         absent = (OF_SPARSE_POLICIES | OF_METHODS) & names
     else:
-        absent = (OF_METHODS & names) - method_named(method).options
+        absent = (OF_METHODS & names) - Methods.parse(method).options
     if absent:
         raise ConfigError(
             f"method {method!r} has no {', '.join(sorted(absent))}, which the search space "

@@ -8,11 +8,15 @@ from pathlib import Path
 from typing import Any
 
 from sb3_sparse.errors import ConfigError, did_you_mean
+from sb3_sparse.topology import method_names
 from sb3_sparse.zoo.strictyaml import parse
+
+DENSE = "dense"
 
 PACKAGE = Path(__file__).parent.parent
 ROOTS = (PACKAGE / "zoo_hparams", PACKAGE.parent / "zoo_hparams")  # in a wheel; in a clone
-METHODS = ("dense", "prune", "static", "set", "rigl")
+METHODS = (DENSE, "prune", "static", "set", "rigl")
+"""What the paper compares; there are settings for every algorithm."""
 
 
 def config_root() -> Path:
@@ -20,24 +24,40 @@ def config_root() -> Path:
     return next(root for root in ROOTS if root.is_dir())
 
 
+def config_folders() -> list[str]:
+    """Return the folders of the shipped configs: those of methods, and presets."""
+    found = {path.name for path in config_root().iterdir() if path.is_dir()}
+    return [*METHODS, *sorted(found - set(METHODS))]
+
+
+def is_preset(name: str) -> bool:
+    """Whether a name is that of a shipped folder, and of no method.
+
+    A preset's configs hold what a method's name cannot say: a method for each network, or further
+    callbacks.
+    """
+    return name not in (DENSE, *method_names()) and name in config_folders()
+
+
 def config_path(method: str, algo: str) -> Path:
     """Return the YAML file of a method and an algorithm, in rl-zoo's form.
 
-    :param method: ``"dense"``, ``"prune"``, ``"static"``, ``"set"`` or ``"rigl"``
+    :param method: one of :func:`config_folders`: a method or a preset
     :param algo: algorithm, e.g. ``"sac"``, or another file in that folder, e.g. ``"dqn_impala"``
     :raises ConfigError: if no such file is shipped
     """
-    if method not in METHODS:
+    folders = config_folders()
+    if method not in folders:
         raise ConfigError(
-            f"no config is shipped for method {method!r}, only for {', '.join(METHODS)}"
-            f"{did_you_mean(method, METHODS)}. Or write one and pass it as --conf-file "
+            f"no config is shipped for method {method!r}, only for {', '.join(folders)}"
+            f"{did_you_mean(method, folders)}. Or write one and pass it as --conf-file "
             "(docs/configs.md)"
         )
     path = config_root() / method / f"{algo}.yml"
     if not path.is_file():
         names = sorted(file.stem for file in path.parent.glob("*.yml"))
         raise ConfigError(
-            f"no config is shipped for {algo!r}, only for {', '.join(names)}"
+            f"no config is shipped for {algo!r} with method {method!r}, only for {', '.join(names)}"
             f"{did_you_mean(algo, names)}. Or write one and pass it as --conf-file "
             "(docs/configs.md)"
         )

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 from sb3_sparse.errors import ConfigError, did_you_mean
 from sb3_sparse.policies.arguments import arguments_of, import_path
-from sb3_sparse.topology import method_named
+from sb3_sparse.topology import Methods
+from sb3_sparse.zoo.configs import DENSE
 
 if TYPE_CHECKING:  # imported when settings are checked, not when names are read
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -21,7 +22,6 @@ if TYPE_CHECKING:  # imported when settings are checked, not when names are read
 POLICY = "sb3_sparse.SparsePolicy"
 ALIAS = "SparsePolicy"
 CALLBACK = "sb3_sparse.SparsityCallback"
-DENSE = "dense"
 ZOO_KEYS = frozenset(
     {
         "callback",
@@ -108,8 +108,19 @@ class Settings(Mapping[str, Any]):
         return found is not None and found[0]
 
     @property
+    def methods(self) -> Methods | None:
+        """The callback's topology methods; None if the settings have no SparsityCallback.
+
+        :raises ConfigError: as :attr:`callback`, and for an unknown method
+        """
+        callback = self.callback
+        return None if callback is None else Methods.of(callback["method"])
+
+    @property
     def method(self) -> str:
         """The topology method; ``"static"`` without a callback, ``"dense"`` at sparsity 0.
+
+        Methods by network read ``"actor=static, critic=rigl"``.
 
         :raises ConfigError: if the policy is not sparse
         """
@@ -119,9 +130,9 @@ class Settings(Mapping[str, Any]):
                 f"the policy must be {POLICY} (with sparsity 0.0 for dense training), got "
                 f"{policy!r}"
             )
-        callback = self.callback
-        if callback is not None:
-            return method_named(callback["method"]).name
+        methods = self.methods
+        if methods is not None:
+            return methods.label
         sparsity = self.policy_kwargs.get("sparsity")
         shares = list(sparsity.values()) if isinstance(sparsity, Mapping) else [sparsity]
         return DENSE if all(share == 0.0 for share in shares) else "static"
@@ -158,6 +169,41 @@ class Settings(Mapping[str, Any]):
                     f"{_listed(names.algorithm)}. Of the policy: {_listed(names.policy)}. Of the "
                     f"mask's schedule: {_listed(names.schedule)}"
                 )
+        if "sparsity" in overrides and "initial_sparsity" not in overrides:
+            self._move_start(content["policy_kwargs"])
+        return Settings(content, imports=self._imports)
+
+    def _move_start(self, kwargs: dict[str, Any]) -> None:
+        """Let a start that is the method's usual one follow the sparsity, e.g. half of it.
+
+        :param kwargs: the policy's arguments with another sparsity
+        """
+        start, methods = kwargs.get("initial_sparsity"), self.methods
+        usual = methods and methods.initial_sparsity(self.policy_kwargs.get("sparsity"))
+        if methods and start and start == usual:
+            kwargs["initial_sparsity"] = methods.initial_sparsity(kwargs["sparsity"])
+
+    def with_methods(self, methods: Methods) -> Settings:
+        """Return these settings with other topology methods.
+
+        The callback keeps the options that any of them uses; networks start as their methods
+        usually do.
+        """
+        content = self.as_dict()
+        found = _sparsity_callback(content, self._imports)
+        if found is None:
+            content["callback"] = [{CALLBACK: {}}]
+            arguments = content["callback"][0][CALLBACK]
+        else:
+            arguments = found[1]
+        kept = {name: value for name, value in arguments.items() if name in methods.options}
+        arguments.clear()
+        arguments.update(method=dict(methods.named) or methods.usual, **kept)
+        kwargs = content["policy_kwargs"]
+        kwargs.pop("initial_sparsity", None)
+        start = methods.initial_sparsity(kwargs.get("sparsity"))
+        if start is not None:
+            kwargs["initial_sparsity"] = start
         return Settings(content, imports=self._imports)
 
     def replaced(self, **content: Any) -> Settings:

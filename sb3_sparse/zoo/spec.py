@@ -15,8 +15,9 @@ from sb3_sparse.errors import ConfigError, did_you_mean
 from sb3_sparse.policies.registry import algorithm_names
 from sb3_sparse.sparsity.distributions import check_distribution, check_sparsity
 from sb3_sparse.sparsity.numeric import is_whole
+from sb3_sparse.topology import Methods
 from sb3_sparse.zoo.arguments import MAPPING, Kind
-from sb3_sparse.zoo.configs import config_path, entry_of, evaluation_of
+from sb3_sparse.zoo.configs import DENSE, config_path, entry_of, evaluation_of, is_preset
 from sb3_sparse.zoo.environments import (
     import_packages,
     is_atari,
@@ -24,7 +25,7 @@ from sb3_sparse.zoo.environments import (
     package_names,
     plain_id,
 )
-from sb3_sparse.zoo.settings import DENSE, Settings
+from sb3_sparse.zoo.settings import Settings
 
 if TYPE_CHECKING:  # imported when settings are checked, not when a run is named
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -53,7 +54,9 @@ class RunSpec:
 
     :param algo: algorithm, e.g. ``"sac"``
     :param env_id: Gymnasium id; ``"package:Id-v0"`` is ``"Id-v0"`` with one more package
-    :param method: ``"dense"`` or a topology method; None: that of ``conf_file``, else RigL
+    :param method: ``"dense"``, a topology method, a method for each network
+        (``{"actor": "static", "critic": "rigl"}`` or ``"actor=static,critic=rigl"``) or a preset,
+        i.e. another folder of the shipped configs; None: that of ``conf_file``, else RigL
     :param sparsity: removed fraction, in [0, 1)
     :param distribution: ``"erk"``, ``"er"`` or ``"uniform"``
     :param seed: seed of all random numbers
@@ -75,7 +78,7 @@ class RunSpec:
 
     algo: str = "dqn"
     env_id: str = "CartPole-v1"
-    method: str | None = None
+    method: str | Mapping[str, str] | None = None
     sparsity: float | None = None
     distribution: str | None = None
     seed: int = 0
@@ -93,6 +96,10 @@ class RunSpec:
     def __post_init__(self) -> None:
         for one in fields(self):  # JSON takes Python's numbers, but not NumPy's
             object.__setattr__(self, one.name, plain(getattr(self, one.name)))
+        if isinstance(self.method, Mapping):
+            object.__setattr__(self, "method", Methods.of(self.method).label)
+        elif isinstance(self.method, str) and "=" in self.method:
+            object.__setattr__(self, "method", Methods.parse(self.method).label)
         self._check_types()
         env_id, packages = plain_id(self.env_id, package_names(self.gym_packages))
         object.__setattr__(self, "env_id", env_id)
@@ -139,9 +146,31 @@ class RunSpec:
     @property
     def config(self) -> Path:
         """The YAML file that the settings come from."""
-        if self.conf_file is not None and _is_path(self.conf_file):
-            return Path(self.conf_file)
-        return config_path(self.method or "rigl", self.conf_file or self.algo)
+        if self._has_own_file:
+            return Path(str(self.conf_file))
+        by_network = self._by_network
+        folder = self._method or "rigl" if by_network is None else by_network.leading
+        return config_path(folder, self.conf_file or self.algo)
+
+    @property
+    def _has_own_file(self) -> bool:
+        return self.conf_file is not None and _is_path(self.conf_file)
+
+    @property
+    def _method(self) -> str | None:
+        """The method as text."""
+        assert not isinstance(self.method, Mapping)  # since it was made
+        return self.method
+
+    @property
+    def _by_network(self) -> Methods | None:
+        """The methods, if each network has its own."""
+        return Methods.parse(self._method) if self._method and "=" in self._method else None
+
+    @property
+    def preset(self) -> str | None:
+        """The preset that the settings come from; reports call the run's method by its name."""
+        return self._method if self._method is not None and is_preset(self._method) else None
 
     def config_entry(self) -> dict[str, Any]:
         """Return a copy of the config's entry for the environment.
@@ -150,7 +179,10 @@ class RunSpec:
         """
         if self.entry is not None:
             return deepcopy(dict(self.entry))
-        return entry_of(self.config, self.env_id, is_atari(self.env_id))
+        entry = entry_of(self.config, self.env_id, is_atari(self.env_id))
+        if self._by_network is not None and not self._has_own_file:
+            entry = Settings(entry).with_methods(self._by_network).as_dict()
+        return entry
 
     def settings(self) -> Settings:
         """Return the config's entry with everything that this run changes in it.
@@ -159,7 +191,8 @@ class RunSpec:
         """
         settings = Settings(self.config_entry())
         method = settings.method
-        if self.method not in (None, method):
+        from_preset = self.preset and (self.entry is not None or not self._has_own_file)
+        if self.method not in (None, method) and not from_preset:
             raise ConfigError(
                 f"{self.config} trains with method {method!r}, not {self.method!r}; leave --method "
                 "out, or change the file"

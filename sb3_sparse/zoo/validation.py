@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Set
+from collections.abc import Iterable, Mapping, Set
 from dataclasses import fields
-from typing import Any
+from typing import Any, cast
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -14,10 +14,11 @@ from sb3_sparse.callback import SparsityCallback
 from sb3_sparse.engine.optimizers import check_weight_decay
 from sb3_sparse.errors import ConfigError, did_you_mean
 from sb3_sparse.policies.arguments import import_classes
+from sb3_sparse.policies.base import BaseSparsePolicy
 from sb3_sparse.policies.config import SPARSITY_MISSING, SparsityConfig
-from sb3_sparse.topology import method_named
+from sb3_sparse.topology import Methods
 from sb3_sparse.zoo.arguments import kind_of
-from sb3_sparse.zoo.settings import CALLBACK, SET_BY_THE_RUN, Names, Settings
+from sb3_sparse.zoo.settings import ALIAS, CALLBACK, SET_BY_THE_RUN, Names, Settings
 
 OF_SPARSITY = frozenset(one.name for one in fields(SparsityConfig))
 
@@ -50,11 +51,13 @@ def check_settings(settings: Settings, algorithm: type[BaseAlgorithm]) -> None:
         )
     if "sparsity" not in kwargs:
         raise ConfigError(SPARSITY_MISSING)
-    SparsityConfig(**{name: value for name, value in kwargs.items() if name in OF_SPARSITY})
+    networks = cast(type[BaseSparsePolicy], algorithm.policy_aliases[ALIAS]).networks
+    config = SparsityConfig(**{n: value for n, value in kwargs.items() if n in OF_SPARSITY})
+    config.check_names(networks)
     check_weight_decay(kwargs.get("weight_decay", 0.0), kwargs.get("optimizer_kwargs"))
     if callback is not None and not settings.has_own_callback:
-        SparsityCallback(**callback)
-    _check_start(kwargs, callback)
+        SparsityCallback(**callback).plans.check(networks)
+    _check_start(kwargs, settings.methods, networks)
 
 
 def _check_keys(given: Mapping[str, Any], allowed: Set[str], what: str, names: Names) -> None:
@@ -92,22 +95,34 @@ def _is_number(text: str) -> bool:
         return False
 
 
-def _check_start(kwargs: Mapping[str, Any], callback: Mapping[str, Any] | None) -> None:
-    """Require a method that prunes for a denser start, and a denser start for such a method."""
-    initial, final = kwargs.get("initial_sparsity"), kwargs["sparsity"]
-    shares = list(final.values()) if isinstance(final, Mapping) else [final]
-    denser = initial is not None and any(initial < share for share in shares)
-    prunes = callback is not None and method_named(callback["method"]).reaches_final
-    if denser and not prunes:
-        how = "without a callback" if callback is None else f"with method {callback['method']!r}"
+def _check_start(
+    kwargs: Mapping[str, Any], methods: Methods | None, networks: Iterable[str]
+) -> None:
+    """Require a method that prunes for a denser start, and a denser start for such a method.
+
+    :param networks: names of the policy's networks
+    """
+    final, initial = kwargs["sparsity"], kwargs.get("initial_sparsity")
+    ends, starts = _by_network(final, networks), _by_network(initial, networks)
+    denser = {n for n, start in starts.items() if start is not None and start < ends[n]}
+    prunes = {n for n in networks if methods is not None and methods[n].reaches_final}
+    if denser - prunes:
+        how = "without a callback" if methods is None else f"with method {methods.label!r}"
         raise ConfigError(
             f"initial_sparsity: {initial} begins denser than sparsity: {final}, and {how} training "
-            "would stay that dense; leave initial_sparsity out, or prune with "
-            f"callback: [{{{CALLBACK}: {{method: prune}}}}]"
+            f"would keep {', '.join(sorted(denser - prunes))} that dense; leave initial_sparsity "
+            f"out there, or prune with callback: [{{{CALLBACK}: {{method: prune}}}}]"
         )
     if prunes and not denser:
-        assert callback is not None
+        assert methods is not None
+        usual = methods.initial_sparsity(final)
         raise ConfigError(
-            f"method {callback['method']!r} begins denser than it ends, but initial_sparsity is "
-            f"{initial} and sparsity {final}; give initial_sparsity: 0.0 and a sparsity above 0"
+            f"method {methods.label!r} begins denser than it ends, but initial_sparsity is "
+            f"{initial} and sparsity {final}; give initial_sparsity: {usual} and a sparsity above 0"
         )
+
+
+def _by_network(value: Any, networks: Iterable[str]) -> dict[str, Any]:
+    """Return the value for each network, of one value for all or of values by name."""
+    named = value if isinstance(value, Mapping) else dict.fromkeys(networks, value)
+    return {network: named.get(network) for network in networks}

@@ -32,7 +32,7 @@ def test_thirty_gradient_steps(name, method, storage):
     assert_networks_alike(ours, stock)
     for network in ours.policy.sparse.networks:
         assert network.clock == (15 if (name, network.name) == ("TD3", "actor") else 30)
-        assert (network.mask_updates > 2) == (method in ("set", "rigl", "prune"))
+        assert (network.mask_updates > 2) == (method not in ("static", "dense"))
 
 
 @pytest.mark.parametrize("method", ["rigl"])
@@ -44,7 +44,7 @@ def test_layers_that_auto_makes_sparse(name, method):
     assert any(layer.is_sparse for layer in ours.policy.sparse.layers)
 
 
-@pytest.mark.parametrize("method", ["set", "rigl", "prune"])
+@pytest.mark.parametrize("method", ["set", "rigl", "prune", "granet"])
 @pytest.mark.parametrize("name", NAMES)
 def test_thirty_updates_move_the_same_connections(name, method):
     # With SB3's epsilon all that has just grown moves by the learning rate, and is as good to drop.
@@ -53,8 +53,37 @@ def test_thirty_updates_move_the_same_connections(name, method):
         name, lambda: moving(method, update_interval=1), policy_kwargs=kwargs
     )
     assert_networks_alike(ours, stock)
-    assert ours.policy.sparse.updates_due == stock.policy.sparse.updates_due >= 29
+    due = [[n.updates_due for n in model.policy.sparse.networks] for model in (ours, stock)]
+    assert due[0] == due[1]
+    assert sum(due[0]) >= 29
     assert ours.policy.sparse.networks[-1].mask_updates >= (3 if method == "prune" else 20)
+
+
+MIXED = [
+    ({"actor": "static", "critic": "rigl"}, {}),
+    ({"actor": "set", "critic": "static"}, {}),
+    ({"actor": "rigl", "critic": "prune"}, {"critic": 0.2}),
+    ({"critic": "granet"}, {"critic": 0.3}),
+]
+
+
+@pytest.mark.parametrize("storage", ["masked", "sparse"])
+@pytest.mark.parametrize(("methods", "start"), MIXED, ids=[str(methods) for methods, _ in MIXED])
+@pytest.mark.parametrize("name", [name for name in NAMES if name != "DQN"])
+def test_a_method_for_each_network(name, methods, start, storage):
+    kwargs = dict(compute=storage, sparsity=0.7, initial_sparsity=start)
+    options = dict(update_interval={"actor": 3, "critic": 2}, begin=0.0, end=1.0)
+    options["update_interval"] = {
+        network: options["update_interval"][network]
+        for network, method in methods.items()
+        if method != "static"
+    }
+    ours, stock = assert_like_stock(
+        name, lambda: sb3_sparse.SparsityCallback(methods, **options), policy_kwargs=kwargs
+    )
+    assert_networks_alike(ours, stock)
+    for network in ours.policy.sparse.networks:
+        assert (network.mask_updates > 2) == (methods.get(network.name, "static") != "static")
 
 
 @pytest.mark.parametrize("name", ["SAC", "PPO"])

@@ -20,7 +20,7 @@ def callback_for(method: str) -> SparsityCallback:
 
 
 def start_of(method: str) -> dict[str, float]:
-    return {"initial_sparsity": 0.0} if method_named(method).reaches_final else {}
+    return {"initial_sparsity": method_named(method).initial_sparsity(0.9)}
 
 
 def test_a_method_of_a_third_party_is_among_those_tested():

@@ -133,9 +133,9 @@ def test_an_optimizer_of_the_users_own_keeps_each_connections_momentum(name, opt
 
     before, masks = remembered(), [layer.mask() for layer in layers]
     sparse = model.policy.sparse
-    sparse.start(SparsityCallback("set", update_interval=1).plan, True, lambda: True)
+    sparse.start(SparsityCallback("set", update_interval=1).plans, True, lambda: True)
     for network in sparse.networks:
-        sparse._move(network, sparse.plan, {})
+        sparse._move(network, {})
     sparse.stop()
     for parameter in model.policy.parameters():
         parameter.grad = th.zeros_like(parameter)
@@ -162,8 +162,8 @@ def test_an_optimizer_whose_memory_cannot_follow_says_so(name, storage):
     own.state[layer.weight]["rows"] = th.zeros(3)
     own.step()  # nothing has moved
     sparse = model.policy.sparse
-    sparse.start(SparsityCallback("set", update_interval=1).plan, True, lambda: True)
-    sparse._move(sparse.networks[0], sparse.plan, {})
+    sparse.start(SparsityCallback("set", update_interval=1).plans, True, lambda: True)
+    sparse._move(sparse.networks[0], {})
     if storage == "sparse":
         with pytest.raises(UnsupportedError, match=r"SGD remembers 'rows' of shape \(3,\)"):
             own.step()
@@ -487,9 +487,9 @@ def test_lbfgs_is_rejected_once_sparse_masks_have_moved(name, storage):
 
     own.step(closure)
     sparse = model.policy.sparse
-    sparse.start(SparsityCallback("set", update_interval=1).plan, True, lambda: True)
+    sparse.start(SparsityCallback("set", update_interval=1).plans, True, lambda: True)
     for network in sparse.networks:
-        sparse._move(network, sparse.plan, {})
+        sparse._move(network, {})
     if storage == "sparse":
         with pytest.raises(UnsupportedError, match="LBFGS does not move each weight by itself"):
             own.step(closure)
@@ -521,7 +521,7 @@ def test_two_backward_passes_before_a_step_add_up_for_rigl():
     for compute in ("masked", "sparse"):
         model = make("SAC", policy_kwargs=dict(compute=compute))
         sparse = model.policy.sparse
-        sparse.start(SparsityCallback("rigl", update_interval=1).plan, True, lambda: True)
+        sparse.start(SparsityCallback("rigl", update_interval=1).plans, True, lambda: True)
         random = th.Generator().manual_seed(0)
         for _ in range(2):
             model.actor(th.randn(6, 3, generator=random), deterministic=True).sum().backward()

@@ -13,7 +13,7 @@ from support import ALGORITHMS, make
 from sb3_sparse import SparsityCallback
 
 METHODS = {"static": {}, "set": {"update_interval": 4}, "rigl": {"update_interval": 4},
-           "prune": {"update_interval": 2}}  # fmt: skip
+           "prune": {"update_interval": 2}, "granet": {"update_interval": 4}}  # fmt: skip
 STEPS = {"PPO": 64, "TRPO": 64, "A2C": 160}
 STOP = {"TRPO": 33}
 """After one rollout: TRPO draws noise for each stored value, so other numbers follow."""
@@ -34,7 +34,7 @@ def storage():
 
 
 def trained(name: str, method: str, compute: str):
-    start = {"initial_sparsity": 0.0} if method == "prune" else {}
+    start = {"initial_sparsity": 0.0} if method in ("prune", "granet") else {}
     model = make(name, policy_kwargs=dict(compute=compute, sparsity=0.8, **start))
     callbacks = [StopAt(STOP.get(name, 1000)), SparsityCallback(method, **METHODS[method])]
     return model.learn(STEPS.get(name, 46), callback=callbacks)

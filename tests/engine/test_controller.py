@@ -13,6 +13,7 @@ from torch import nn
 from sb3_sparse.engine.controller import Controller
 from sb3_sparse.engine.network import SparseNetwork
 from sb3_sparse.engine.plan import Plan
+from sb3_sparse.engine.plans import Plans
 from sb3_sparse.errors import TopologyError
 from sb3_sparse.topology import Exchange, TopologyMethod
 
@@ -35,8 +36,12 @@ def rig(method="rigl", optimizer=None, functional=False, **plan):
     controller = Controller([network], seed=1, functional_gradients=functional)
     controller.attach()
     settings = dict(update_interval=1, drop_fraction=1 / 3, begin=0.0, end=0.8, update_on="step")
-    controller.start(Plan(method, **{**settings, **plan}), soft_targets=True, in_force=lambda: True)
+    start(controller, Plan(method, **{**settings, **plan}))
     return owner, layer, controller
+
+
+def start(controller, plan, in_force=lambda: True):
+    controller.start(Plans(plan), soft_targets=True, in_force=in_force)
 
 
 def step(owner, gradient=GRADIENT, clip=None):
@@ -69,7 +74,7 @@ def test_a_clipped_gradient_has_the_active_norm_and_a_grown_connection_is_scaled
 
 def test_moments_are_zeroed_on_drop_and_grow_and_kept_by_what_is_regrown():
     owner, layer, controller = rig(optimizer=lambda p: th.optim.Adam(p, lr=0.01))
-    controller.plan = None
+    controller.drop_plans()
     step(owner, [[1.0] * 4] * 3)
     before = owner.optimizer.state[layer.weight]["exp_avg"].clone()
     assert before[1, 0] != 0
@@ -85,7 +90,7 @@ def test_moments_are_zeroed_on_drop_and_grow_and_kept_by_what_is_regrown():
     owner.optimizer.register_step_pre_hook(look)  # after ours: between the move and the step
     weight_before = layer.weight.detach().clone()
     plan = Plan("rigl", 1, 1 / 3, 0.0, 0.8, "step")
-    controller.start(plan, soft_targets=True, in_force=lambda: True)
+    start(controller, plan)
     step(owner)
     for moment in (seen["exp_avg"], seen["exp_avg_sq"]):
         assert moment.flatten()[5] == 0  # dropped
@@ -178,7 +183,7 @@ def test_an_update_left_waiting_by_an_interruption_is_forgotten():
     owner, layer, controller = rig(update_on="rollout")
     before = layer.mask()
     step(owner)
-    controller.start(controller.plan, soft_targets=True, in_force=lambda: True)
+    start(controller, controller.networks[0].plan)
     controller.flush()
     np.testing.assert_array_equal(layer.mask(), before)
 
@@ -209,8 +214,8 @@ def test_a_copy_trains_on_its_own_once_hooks_are_attached_and_the_original_stays
     owner, layer, controller = rig()
     owner.controller = controller
     twin = copy.deepcopy(owner)
-    assert twin.controller.plan is None
-    twin.controller.start(controller.plan, soft_targets=True, in_force=lambda: True)
+    assert not twin.controller.has_plans
+    start(twin.controller, controller.networks[0].plan)
     twin.controller.attach()
     step(twin)
     assert np.flatnonzero(twin.controller.networks[0].layers[0].mask()).tolist() == [
@@ -239,7 +244,7 @@ def test_a_new_optimizer_is_hooked_at_the_next_attach():
 
 def test_loaded_weights_are_masked_at_once_and_loaded_moments_before_the_next_step():
     owner, layer, controller = rig(optimizer=lambda p: th.optim.Adam(p, lr=0.1))
-    controller.plan = None
+    controller.drop_plans()
     dense = nn.Sequential(nn.Linear(4, 3, bias=False))
     adam = th.optim.Adam(dense.parameters(), lr=0.1)
     dense[0].weight.sum().backward()
@@ -257,12 +262,12 @@ def test_loaded_weights_are_masked_at_once_and_loaded_moments_before_the_next_st
 def test_a_plan_of_a_training_that_is_over_is_dropped_at_the_next_one():
     owner, _, controller = rig()
     going_on = True
-    controller.start(controller.plan, soft_targets=True, in_force=lambda: going_on)
+    start(controller, controller.networks[0].plan, lambda: going_on)
     controller.begin_training(owner)
-    assert controller.plan is not None
+    assert controller.has_plans
     going_on = False
     controller.begin_training(owner)
-    assert controller.plan is None
+    assert not controller.has_plans
 
 
 @pytest.mark.parametrize("sparse", [False, True])

@@ -101,6 +101,26 @@ def test_a_start_sparser_than_the_end_is_refused():
         make("SAC", policy_kwargs=dict(initial_sparsity=0.95))
 
 
+def test_the_start_may_be_given_by_network_and_a_network_left_out_starts_as_it_ends():
+    for start in (dict(critic=0.0), dict(critic=0.0, actor=None)):
+        actor, critic = make(
+            "SAC", policy_kwargs=dict(initial_sparsity=start)
+        ).policy.sparse.networks
+        assert [layer.nnz for layer in actor.layers] == [layer.final_nnz for layer in actor.layers]
+        assert critic.nnz == critic.size
+        assert critic.denser
+        assert not actor.denser
+
+
+def test_a_start_by_network_is_checked_by_name_and_by_value():
+    with pytest.raises(ConfigError, match="given for 'value'; .* networks 'actor', 'critic'"):
+        make("SAC", policy_kwargs=dict(initial_sparsity=dict(value=0.5)))
+    with pytest.raises(ConfigError, match="initial_sparsity of 'actor' must be a number"):
+        make("SAC", policy_kwargs=dict(initial_sparsity=dict(actor="little")))
+    with pytest.raises(ConfigError, match="initial_sparsity=0.95 is above .* of 'critic'"):
+        make("SAC", policy_kwargs=dict(initial_sparsity=dict(critic=0.95)))
+
+
 def test_json_lists_are_accepted_where_policy_kwargs_came_from_a_file():
     model = make("SAC", policy_kwargs=dict(dense_layers=["output"]))
     assert model.policy.sparse.networks[0].dense_layers

@@ -9,6 +9,7 @@ import pickle
 import subprocess
 import sys
 import zipfile
+from itertools import product
 
 import numpy as np
 import pytest
@@ -129,12 +130,23 @@ def test_a_pickled_policy_comes_back_with_its_masks():
         assert th.equal(value, twin.state_dict()[key]), key
 
 
-@pytest.mark.parametrize("method", ["set", "rigl", "prune"])
-@pytest.mark.parametrize("name", ["SAC", "DQN", "PPO"])
+STARTS = {"prune": 0.0, "granet": 0.45}
+
+
+@pytest.mark.parametrize(
+    ("name", "method"),
+    [
+        *product(["SAC", "DQN", "PPO"], ["set", "rigl", "prune", "granet"]),
+        *product(["SAC", "PPO"], [{"critic": "rigl"}, {"actor": "set", "critic": "granet"}]),
+    ],
+)
 def test_a_resumed_run_makes_the_moves_of_an_uninterrupted_one(name, method, tmp_path):
     """Given the same data and random numbers, bit for bit."""
-    start = dict(initial_sparsity=0.0) if method == "prune" else {}
-    model = make(name, policy_kwargs=start)
+    if isinstance(method, str):
+        start = STARTS.get(method)
+    else:
+        start = {network: STARTS[one] for network, one in method.items() if one in STARTS}
+    model = make(name, policy_kwargs=dict(initial_sparsity=start))
     options = dict(update_interval=4, begin=0.0)
     model.learn(64, callback=SparsityCallback(method, **options))
     model.save(tmp_path / "model")
@@ -144,12 +156,12 @@ def test_a_resumed_run_makes_the_moves_of_an_uninterrupted_one(name, method, tmp
         resumed.load_replay_buffer(tmp_path / "buffer")
     else:
         resumed.rollout_buffer = copy.deepcopy(model.rollout_buffer)
-    plan = SparsityCallback(method, **options).plan
+    plans = SparsityCallback(method, **options).plans
     for each in (model, resumed):
         each.set_logger(model.logger)
         sparse = each.policy.sparse
         sparse.progress = 0.3
-        sparse.start(plan, soft_targets=name == "SAC", in_force=lambda: True)
+        sparse.start(plans, soft_targets=name == "SAC", in_force=lambda: True)
         np.random.seed(1)
         th.manual_seed(1)
         for _ in range(3):
@@ -158,7 +170,7 @@ def test_a_resumed_run_makes_the_moves_of_an_uninterrupted_one(name, method, tmp
             else:
                 each.train(gradient_steps=4, batch_size=16)
         sparse.stop()
-    assert model.policy.sparse.networks[0].mask_updates > 0
+    assert model.policy.sparse.networks[-1].mask_updates > 0
     assert_same(state_of(model), state_of(resumed))
 
 

@@ -6,14 +6,16 @@ import numpy as np
 from support import make
 
 from sb3_sparse.engine.plan import Plan
+from sb3_sparse.engine.plans import Plans
 
 
 def move_everything(model, soft: bool) -> None:
     """One SET update of all networks, with no gradient step."""
     sparse = model.policy.sparse
-    sparse.start(Plan("set", 1, 0.5, 0.0, 0.8, "step"), soft_targets=soft, in_force=lambda: True)
+    plans = Plans(Plan("set", 1, 0.5, 0.0, 0.8, "step"))
+    sparse.start(plans, soft_targets=soft, in_force=lambda: True)
     for network in sparse.networks:
-        sparse._move(network, sparse.plan, {})
+        sparse._move(network, {})
     sparse.stop()
 
 

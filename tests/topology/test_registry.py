@@ -9,7 +9,7 @@ from sb3_sparse.topology import DropGrow, TopologyMethod, method_named, method_n
 from sb3_sparse.topology import registry as registry_module
 from sb3_sparse.topology.base import NOTHING
 
-BUILT_IN = ("prune", "rigl", "set", "static")
+BUILT_IN = ("granet", "prune", "rigl", "set", "static")
 
 
 @pytest.fixture(autouse=True)
@@ -119,6 +119,7 @@ def test_a_class_that_never_set_a_name_is_an_error():
         ("set", False, True, False, 0.0, True),
         ("rigl", True, True, False, 0.0, True),
         ("prune", False, False, True, 0.2, False),
+        ("granet", True, True, True, 0.0, True),
     ],
 )
 def test_what_each_method_says_of_itself(

@@ -36,7 +36,7 @@ INIT = [True, False]
                 ),
                 200,
             )
-            for method in ("set", "rigl", LeastIndex.name)
+            for method in ("set", "rigl", "granet", LeastIndex.name)
         ),
     ],
 )

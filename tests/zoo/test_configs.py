@@ -12,13 +12,15 @@ import sb3_sparse.zoo.configs as configs
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.policies.arguments import arguments_of
 from sb3_sparse.zoo import config_path
-from sb3_sparse.zoo.configs import METHODS, entry_of, evaluation_of
+from sb3_sparse.zoo.configs import METHODS, config_folders, entry_of, evaluation_of, is_preset
 from sb3_sparse.zoo.environments import is_atari
 from sb3_sparse.zoo.settings import CALLBACK, ZOO_KEYS, Settings
 from sb3_sparse.zoo.spec import RunSpec, algorithms
+from sb3_sparse.zoo.validation import check_settings
 
 SHIPPED = sorted(configs.config_root().glob("*/*.yml"))
 MUJOCO_IDS = [f"{name}-{version}" for name in paper.MUJOCO for version in ("v5", "v4")]
+PRESETS = [name for name in config_folders() if is_preset(name)]
 GAME_IDS = [f"{game}NoFrameskip-v4" for game in paper.GAMES]
 
 
@@ -171,12 +173,44 @@ def test_every_key_is_known_to_the_algorithm_the_policy_or_the_zoo(path):
         settings = entry_of(path, key, atari=key == "atari")
         assert set(settings) <= arguments_of(algorithm) | ZOO_KEYS, key
         assert set(settings["policy_kwargs"]) <= policy, key
-        assert Settings(settings).method == path.parent.name
+        if path.parent.name not in PRESETS:
+            assert Settings(settings).method == path.parent.name
 
 
-def test_every_method_has_every_algorithm():
+def test_every_method_of_the_paper_has_every_algorithm():
     names = {*algorithms(), "dqn_impala"}
-    assert {(p.parent.name, p.stem) for p in SHIPPED} == {(m, n) for m in METHODS for n in names}
+    of_paper = {(p.parent.name, p.stem) for p in SHIPPED if p.parent.name in METHODS}
+    assert of_paper == {(m, n) for m in METHODS for n in names}
+
+
+BEYOND = [("granet", "sac"), ("granet", "dqn"), ("granet", "ppo"), ("mst", "sac"), ("mst", "td3")]
+
+
+@pytest.mark.parametrize(("folder", "algo"), BEYOND)
+def test_configs_beyond_the_paper_are_those_of_rigl_with_their_own_method(folder, algo):
+    path = config_path(folder, algo)
+    rigl = yaml.safe_load(config_path("rigl", algo).read_text())
+    content = yaml.safe_load(path.read_text())
+    assert content.keys() == rigl.keys()
+    for key, settings in content.items():
+        theirs, kwargs = rigl[key], rigl[key]["policy_kwargs"]
+        if folder == "granet":
+            kwargs["initial_sparsity"] = 0.45
+            theirs["callback"][0][CALLBACK]["method"] = "granet"
+        else:
+            kwargs.update(sparsity=0.6, distribution="er")
+            theirs["callback"][0][CALLBACK]["method"] = {"actor": "static", "critic": "rigl"}
+        assert settings == theirs, key
+        check_settings(Settings(settings), algorithms()[algo])
+
+
+def test_folders_are_methods_and_presets():
+    assert config_folders()[:5] == list(METHODS)
+    assert {"granet", "mst"} <= set(config_folders())
+    presets = [name for name in config_folders() if is_preset(name)]
+    assert "mst" in presets
+    assert set(presets).isdisjoint([*METHODS, "granet"])
+    assert not is_preset("gmp")
 
 
 def test_our_lookup_is_that_of_the_zoo(tmp_path):

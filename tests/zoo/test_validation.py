@@ -242,7 +242,7 @@ def test_a_key_that_nothing_takes_is_refused_with_the_nearest_or_its_place(chang
         (0.0, 0.9, None, "begins denser than sparsity: 0.9, and without a callback training would"),
         (0.5, 0.9, None, "without a callback"),
         (0.0, {"q_net": 0.9}, None, "without a callback"),
-        (0.0, 0.9, "rigl", "with method 'rigl' training would stay that dense"),
+        (0.0, 0.9, "rigl", "with method 'rigl' training would keep q_net that dense"),
         (0.0, 0.9, "static", "with method 'static'"),
         (None, 0.9, "prune", "method 'prune' begins denser than it ends"),
         (0.9, 0.9, "prune", "method 'prune' begins denser"),

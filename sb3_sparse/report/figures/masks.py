@@ -18,7 +18,7 @@ from sb3_sparse.zoo.folder import env_name
 
 HEADS = ("run", "method", "sparsity", "layer", "shape", "block row", "densities of the blocks")
 BLOCKS, LAYERS, CLOSE_TO = 128, 4, 0.9
-ORDER = ("rigl", "set", "prune", "static")
+ORDER = ("rigl", "set", "prune", "granet", "mst", "static")
 
 
 @figure(
