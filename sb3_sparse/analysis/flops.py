@@ -149,13 +149,15 @@ def flops(
     """Count the FLOPs of any SB3 policy, and of a gradient step if a model is given.
 
     A multiply-add counts 2, a bias and an activation 1 each. Sparse layers count their active
-    connections, for each output position, as if zeros cost nothing.
+    connections, for each output position, as if zeros cost nothing. A LayerNorm counts 7 for each
+    unit (5 without scale and shift), and the sum of a SimBa block 1; both count with the layer
+    before them.
 
     For each sample of the minibatch, a gradient step counts 1 for a forward pass, also of a target
     network, 2 for a backward pass of a network that is trained, and 1 for the gradient that the
     actor gets through a critic. (There, stock SB3 computes the critic's own gradients too and
     throws them away, which does not count.) How often each network runs is declared where the
-    algorithm is registered. Optimizers, averaging of targets, normalisation layers, losses and
+    algorithm is registered. Optimizers, averaging of targets, batch normalisation, losses and
     RigL's dense gradients do not count.
 
     :param policy_or_model: sparse or stock, with any features extractor of Linear and Conv layers

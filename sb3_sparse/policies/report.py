@@ -5,19 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
-import numpy as np
-import torch as th
-from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.preprocessing import preprocess_obs
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
-from torch import nn
 
 from sb3_sparse.engine.network import SparseNetwork
 from sb3_sparse.engine.prunable import Prunable
-from sb3_sparse.policies.internals import space_of
+from sb3_sparse.policies.costs import conv_positions, flops_behind
 from sb3_sparse.policies.spec import NetworkSpec, in_target
 
 SPARSE = "sparse"
@@ -36,8 +29,9 @@ class LayerReport:
     :param shape: weight shape, torch order
     :param nnz: active connections
     :param parameters: nnz and biases
-    :param flops: FLOPs of one forward pass at batch 1: 2 for a multiply-add, 1 for each bias and
-        activation
+    :param flops: FLOPs of one forward pass at batch 1: 2 for a multiply-add, 1 for each bias, and
+        those of what comes behind the layer (see
+        :func:`~sb3_sparse.policies.costs.flops_per_unit`)
     :param dense_flops: the same for the dense layer; 0: neither these nor ``flops`` are known
     :param in_budget: False for a layer left dense by ``dense_layers``
     :param compute: how it computes: ``"sparse"``: with its active connections only;
@@ -63,7 +57,7 @@ class LayerReport:
         *,
         nnz: int,
         biases: int = 0,
-        activated: bool = False,
+        behind: int = 0,
         positions: int = 0,
         in_budget: bool = False,
         is_sparse: bool = False,
@@ -71,12 +65,12 @@ class LayerReport:
         """Count parameters and FLOPs.
 
         :param biases: number of biases
-        :param activated: whether an activation function follows
+        :param behind: FLOPs for each output of what comes behind the layer
         :param positions: output positions of a convolution, 1 for a linear layer; 0: not known
         :param is_sparse: whether the layer stores only its active connections
         """
         size = math.prod(shape)
-        others = biases + (shape[0] if activated else 0)
+        others = biases + shape[0] * behind
         return cls(
             network,
             name,
@@ -174,8 +168,8 @@ def build_report(policy: BasePolicy, networks: Iterable[SparseNetwork]) -> Spars
     :param policy: sparse or dense
     :param networks: its networks; those of a dense policy have all layers outside the budget
     """
-    positions = _conv_positions(policy)
-    activated = _activated(policy)
+    positions = conv_positions(policy)
+    behind = flops_behind(policy)
     layers = []
     counted: set[int] = set()
     for network in networks:
@@ -196,7 +190,7 @@ def build_report(policy: BasePolicy, networks: Iterable[SparseNetwork]) -> Spars
                     shape,
                     nnz=nnz,
                     biases=0 if module.bias is None else module.bias.numel(),
-                    activated=id(module) in activated,
+                    behind=behind.get(id(module), 0),
                     positions=positions.get(id(module), 1),
                     in_budget=in_budget,
                     is_sparse=is_sparse,
@@ -227,50 +221,3 @@ def _other_matrices(policy: BasePolicy, counted: set[int]) -> list[LayerReport]:
         network, shape = (within or list(specs))[0], tuple(parameter.shape)
         found.append(LayerReport.of(network, name, shape, nnz=parameter.numel()))
     return found
-
-
-def _activated(policy: nn.Module) -> set[int]:
-    """Ids of the layers that an activation function follows."""
-    found = set()
-    for sequence in policy.modules():
-        if isinstance(sequence, nn.Sequential):
-            for layer, after in zip(list(sequence), list(sequence)[1:], strict=False):
-                if type(after).__module__ == "torch.nn.modules.activation":
-                    found.add(id(layer))
-    return found
-
-
-def _conv_positions(policy: BasePolicy) -> dict[int, int]:
-    """Output positions of each convolution, measured in a forward pass of a zero observation."""
-    positions: dict[int, int] = {}
-
-    def note(module: nn.Module, inputs: object, output: th.Tensor) -> None:
-        positions[id(module)] = math.prod(output.shape[2:])
-
-    convs = [m for m in policy.modules() if isinstance(m, (nn.Conv1d, nn.Conv2d, nn.Conv3d))]
-    if not convs:
-        return positions
-    handles = [conv.register_forward_hook(note) for conv in convs]
-    space = policy.observation_space
-    empty = _zeros(space, policy.device)
-    modes = {module: module.training for module in policy.modules()}
-    try:
-        with th.no_grad():
-            observation = preprocess_obs(empty, space, normalize_images=policy.normalize_images)
-            for module in policy.modules():
-                if isinstance(module, BaseFeaturesExtractor) and space_of(module) == space:
-                    module.eval()(observation)
-    finally:
-        for handle in handles:
-            handle.remove()
-        for module, mode in modes.items():
-            module.training = mode
-    return positions
-
-
-def _zeros(space: spaces.Space[Any], device: th.device) -> th.Tensor | dict[str, th.Tensor]:
-    if isinstance(space, spaces.Dict):
-        parts = {key: _zeros(part, device) for key, part in space.spaces.items()}
-        return {key: part for key, part in parts.items() if isinstance(part, th.Tensor)}
-    assert space.shape is not None
-    return th.as_tensor(np.zeros((1, *space.shape), dtype=space.dtype), device=device)

@@ -11,9 +11,10 @@ from algorithms_support import NAMES
 from gymnasium import spaces
 from stable_baselines3 import DQN
 from stable_baselines3.common.preprocessing import preprocess_obs
-from stable_baselines3.common.torch_layers import NatureCNN
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, NatureCNN
 from stable_baselines3.dqn.policies import DQNPolicy
 from support import make
+from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
 
 import sb3_sparse
@@ -78,6 +79,42 @@ def test_a_sparse_count_by_hand():
     assert [layer.forward for layer in report.layers] == [8 + 20, 20 + 20, 4 + 2]
     assert report.forward("q_net") == 74
     assert report.dense_forward() == (80 + 20) + (200 + 20) + (40 + 2)
+
+
+def test_a_simba_network_by_hand():
+    kwargs = {"net_arch": [10], "distribution": "uniform"}
+    model = make("DQN", policy="SparseSimbaPolicy", policy_kwargs=kwargs)
+    # CartPole: 4 -> 10, 10 -> 40 -> 10, 10 -> 2; a tenth of 40, 400, 400 and 20 connections
+    report = flops(model)
+    assert [layer.nnz for layer in report.layers] == [4, 40, 40, 2]
+    # Behind the first a norm; behind the others a ReLU, the sum of the block and the last norm
+    norm = 10 * (5 + 2)
+    assert [layer.forward for layer in report.layers] == [
+        8 + 10 + norm,
+        80 + 40 + 40,
+        80 + 10 + 10 + norm,
+        4 + 2,
+    ]
+    dense = 2 * (40 + 400 + 400 + 20) + (10 + 40 + 10 + 2) + 40 + 10 + 2 * norm
+    assert report.dense_forward() == dense
+    assert report.step() == model.batch_size * 4 * report.forward()
+
+
+@pytest.mark.parametrize(("affine", "bias", "each"), [(0, 0, 5), (1, 0, 6), (1, 1, 7)])
+def test_norms_of_ones_own_count_as_well(affine, bias, each):
+    class Own(BaseFeaturesExtractor):
+        def __init__(self, space):
+            super().__init__(space, 6)
+            norm = nn.LayerNorm(6, elementwise_affine=bool(affine), bias=bool(bias))
+            self.layers = nn.Sequential(nn.Linear(4, 6), norm, nn.Tanh(), nn.Linear(6, 6))
+
+        def forward(self, x):
+            return self.layers(x)
+
+    kwargs = {"net_arch": [], "features_extractor_class": Own}
+    first, second, _ = flops(make("DQN", policy="MlpPolicy", policy_kwargs=kwargs).policy).layers
+    assert first.forward == 2 * 24 + 6 + 6 * each + 6
+    assert second.forward == 2 * 36 + 6
 
 
 def test_gradient_steps_by_hand():

@@ -171,6 +171,15 @@ def test_what_is_own_attribute_names_and_shapes_is_the_policys_own_report(
     assert found.compute == kwargs.get("compute", "auto")
 
 
+@pytest.mark.parametrize("width", [16, 200])
+@pytest.mark.parametrize("algorithm", sorted({*ALGORITHMS} - {"CrossQ"}))
+def test_simba_networks_are_reported_as_by_the_policy_itself(algorithm, width, tmp_path):
+    kwargs = {"net_arch": [width, width]}
+    model = make(algorithm, policy="SparseSimbaPolicy", policy_kwargs=kwargs)
+    model.save(tmp_path / "model.zip")
+    assert inspect_model(tmp_path / "model.zip").report == model.policy.sparsity_report()
+
+
 class Own(BaseFeaturesExtractor):
     """An extractor of the user's, of which nobody knows what it does with its layers."""
 
