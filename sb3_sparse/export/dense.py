@@ -22,6 +22,7 @@ from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.policies.config import SparsityConfig
 from sb3_sparse.policies.internals import LAST_SEEN
 from sb3_sparse.policies.saving import parts_of
+from sb3_sparse.policies.simba import SimbaPolicy
 
 STOCK = ("stable_baselines3.", "sb3_contrib.")
 FORGOTTEN = (
@@ -61,6 +62,11 @@ def _stock_class(policy: type[BasePolicy]) -> type[BasePolicy]:
     """Return the stock class below a sparse policy class; any other class unchanged."""
     if not issubclass(policy, BaseSparsePolicy):
         return policy
+    if issubclass(policy, SimbaPolicy):
+        raise UnsupportedError(
+            f"{policy.__name__} is made of SimBa networks, which stock SB3 does not have; export "
+            "to onnx, numpy or c instead"
+        )
     for cls in policy.__mro__:
         if cls.__module__.startswith(STOCK):
             assert issubclass(cls, BasePolicy)

@@ -7,10 +7,21 @@ from dataclasses import dataclass
 import numpy as np
 
 from sb3_sparse.export.graph import Graph
-from sb3_sparse.export.nodes import Activation, Conv, Flatten, MaxPool, Node, PerUnit, Slice
+from sb3_sparse.export.nodes import (
+    Activation,
+    Add,
+    Conv,
+    Flatten,
+    MaxPool,
+    Multiply,
+    Node,
+    PerUnit,
+    Slice,
+    Standardize,
+)
 
-IN_PLACE = (Activation, PerUnit)
-"""Nodes that may overwrite their input."""
+IN_PLACE = (Activation, PerUnit, Standardize, Add, Multiply)
+"""Nodes that may overwrite an input that nothing reads later."""
 
 
 @dataclass(frozen=True)
@@ -41,14 +52,9 @@ def plan_memory(graph: Graph) -> Memory:
     The observation and the action belong to the caller and have no place.
     """
     last_value = len(graph.nodes)
-    home = list(range(last_value + 1))
-    """The value whose place each value uses."""
+    home = _homes(graph)
     last_use = [0] * (last_value + 1)
     for value, node in enumerate(graph.nodes, start=1):
-        before = node.inputs[0]
-        in_place = isinstance(node, IN_PLACE) and home[before] and _read_once(graph, before)
-        if isinstance(node, (Flatten, Slice)) or in_place:
-            home[value] = home[before] if value != last_value else value
         for taken in node.inputs:
             last_use[home[taken]] = value
     places: dict[int, int] = {}
@@ -79,11 +85,19 @@ def plan_memory(graph: Graph) -> Memory:
     return Memory(size, places, borders)
 
 
-def _read_once(graph: Graph, value: int) -> bool:
-    """Tell whether a single node reads a value, including the values that it is a view of."""
-    while len(graph.users(value)) == 1:
-        node = graph.nodes[value - 1]
-        if not isinstance(node, Flatten):
-            return True
-        value = node.inputs[0]
-    return False
+def _homes(graph: Graph) -> list[int]:
+    """Return for each value the one whose place it uses: itself, or an input of its node."""
+    last_value = len(graph.nodes)
+    last_reader = [0] * (last_value + 1)
+    for value, node in enumerate(graph.nodes, start=1):
+        for taken in node.inputs:
+            last_reader[taken] = value
+    home = list(range(last_value + 1))
+    for value, node in enumerate(graph.nodes[:-1], start=1):
+        if isinstance(node, (Flatten, Slice)):
+            home[value] = home[node.inputs[0]]
+        elif isinstance(node, IN_PLACE):
+            needed = {home[before] for before in range(value) if last_reader[before] > value}
+            free = (home[taken] for taken in node.inputs if home[taken] not in {0, *needed})
+            home[value] = next(free, value)
+    return home

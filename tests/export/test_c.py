@@ -34,6 +34,7 @@ def policies():
         "dense": make("PPO", policy="MlpPolicy"),
         "images": make("DQN", TinyImages()),
         "residual": make("PPO", TinyImages(False), policy_kwargs=impala),
+        "simba": make("SAC", policy="SparseSimbaPolicy"),
     }
 
 
@@ -42,7 +43,7 @@ def models():
     return policies()
 
 
-KINDS = ["vectors", "dense", "images", "residual"]
+KINDS = ["vectors", "dense", "images", "residual", "simba"]
 
 
 def works(*options):

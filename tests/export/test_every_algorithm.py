@@ -79,6 +79,27 @@ def test_sparse_policies(algorithm, to, tmp_path):
     assert report.parity.random == 1000
 
 
+@pytest.mark.parametrize("compute", ["masked", "sparse"])
+@pytest.mark.parametrize("algorithm", sorted({*ALGORITHMS} - {"CrossQ"}))
+def test_simba_networks(algorithm, compute, tmp_path):
+    kwargs = dict(sparsity=0.7, compute=compute, net_arch=[16, 16])
+    model = trained(algorithm, policy="SparseSimbaPolicy", policy_kwargs=kwargs)
+    draw_norms(model)
+    if hasattr(model, "exploration_rate"):
+        favour_no_action(model)
+    for to in ("c", "numpy", "onnx"):
+        check(model, tmp_path, to)
+
+
+def draw_norms(model):
+    """Give every unit of a LayerNorm another scale and shift; training begins with 1 and 0."""
+    th.manual_seed(0)
+    for module in model.policy.modules():
+        if isinstance(module, th.nn.LayerNorm):
+            module.weight.data.uniform_(0.5, 2.0)
+            module.bias.data.normal_()
+
+
 @pytest.mark.parametrize("to", FORMATS)
 @pytest.mark.parametrize("algorithm", ["DQN", "SAC", "PPO", "TD3", "CrossQ", "QRDQN"])
 def test_stock_policies(algorithm, to, tmp_path):
