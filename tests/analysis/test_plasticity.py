@@ -75,14 +75,27 @@ def test_many_observations_are_run_in_parts():
     assert [len(whole[n].features) for n in ("actor", "critic")] == [1, 2]  # heads, twins
 
 
+@pytest.mark.parametrize("policy", ["SparsePolicy", "SparseSimbaPolicy"])
 @pytest.mark.parametrize("compute", ["masked", "sparse"])
-def test_sparse_networks_show_what_masked_ones_do(compute):
-    model = make("SAC", policy_kwargs={"compute": compute})
+def test_sparse_networks_show_what_masked_ones_do(compute, policy):
+    model = make("SAC", policy=policy, policy_kwargs={"compute": compute})
     observations = np.linspace(-1, 1, 60, dtype=np.float32).reshape(20, 3)
     (features,) = activity(model, observations)["actor"].features
     with th.no_grad():
         latent = model.actor.latent_pi(th.from_numpy(observations))
     np.testing.assert_allclose(features, latent.numpy(), rtol=1e-5, atol=1e-6)
+
+
+def test_units_of_simba_networks_are_those_within_the_blocks():
+    kwargs = {"sparsity": 0.0, "net_arch": [3, 3]}
+    model = make("DQN", policy="SparseSimbaPolicy", policy_kwargs=kwargs)
+    second = model.policy.q_net.q_net[2].residual[1]
+    with th.no_grad():
+        second.weight.zero_()
+        second.bias.copy_(th.tensor([-1.0] * 9 + [1.0] * 3))
+    first, last = activity(model, np.ones((2, 4), np.float32))["q_net"].activations
+    assert first.shape == (12,)
+    np.testing.assert_array_equal(last, [0] * 9 + [1] * 3)
 
 
 @pytest.mark.parametrize("name", ["TD3", "A2C", "QRDQN", "TQC", "CrossQ"])

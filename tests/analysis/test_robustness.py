@@ -60,9 +60,10 @@ def test_vectors_get_noise_in_units_of_their_std():
         noisy_vec_env(Grey, 0.5, std=STD)
 
 
+@pytest.mark.parametrize("policy", ["SparsePolicy", "SparseSimbaPolicy"])
 @pytest.mark.parametrize("deterministic", [True, False])
-def test_returns_are_the_monitors_and_depend_on_the_seed_alone(deterministic):
-    model = make("DQN", Grey(), policy_kwargs={"net_arch": [8]})
+def test_returns_are_the_monitors_and_depend_on_the_seed_alone(deterministic, policy):
+    model = make("DQN", Grey(), policy=policy, policy_kwargs={"net_arch": [8]})
     model.exploration_rate = 0.5
 
     def envs(sigma):

@@ -65,16 +65,25 @@ def gradients_of_train(model, batch):
     return found
 
 
+DENSE = {
+    "SparsePolicy": dict(policy="MlpPolicy"),
+    "SparseSimbaPolicy": dict(policy="SparseSimbaPolicy", policy_kwargs={"sparsity": 0.0}),
+}
+
+
+@pytest.mark.parametrize("policy", DENSE)
 @pytest.mark.parametrize("compute", ["masked", "sparse"])
 @pytest.mark.parametrize("name", STILL)
-def test_per_sample_gradients_average_to_the_dense_gradient_of_sb3(name, compute):
+def test_per_sample_gradients_average_to_the_dense_gradient_of_sb3(name, compute, policy):
     arguments = dict(learning_rate=0.0, **STILL[name])
-    sparse = make(name, policy_kwargs={"compute": compute}, **arguments)
+    sparse = make(name, policy=policy, policy_kwargs={"compute": compute}, **arguments)
     sparse.learn(64)
-    stock = make(name, policy="MlpPolicy", **arguments)
+    stock = make(name, **DENSE[policy], **arguments)
     stock.learn(64)
     weights = sparse.policy.state_dict()
-    stock.policy.load_state_dict({key: weights[key] for key in stock.policy.state_dict()})
+    with th.no_grad():
+        for key, parameter in stock.policy.named_parameters():
+            parameter.copy_(weights[key])
     batch = sample_batch(sparse)
     if name == "PPO":
         moved = 0.3 * th.randn(16, generator=th.Generator().manual_seed(0))

@@ -37,9 +37,15 @@ def kept_by_hand(weights: np.ndarray, count: int) -> np.ndarray:
     return mask.reshape(weights.shape)
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_every_layer_keeps_its_largest_weights_and_the_model_stays_as_it_is(name):
-    model = trained(name)
+DENSE = [
+    *((name, "MlpPolicy", {}) for name in NAMES),
+    *((name, "SparseSimbaPolicy", {"sparsity": 0.0}) for name in NAMES if name != "CrossQ"),
+]
+
+
+@pytest.mark.parametrize(("name", "policy", "kwargs"), DENSE)
+def test_every_layer_keeps_its_largest_weights_and_the_model_stays_as_it_is(name, policy, kwargs):
+    model = make(name, policy=policy, policy_kwargs=kwargs).learn(80)
     before = state(model)
     twin = sparsify(model, 0.8)
     assert type(twin) is type(model)
@@ -55,7 +61,7 @@ def test_every_layer_keeps_its_largest_weights_and_the_model_stays_as_it_is(name
             np.testing.assert_array_equal(after[f"{layer.name}.weight"], np.where(kept, dense, 0))
     for key, value in before.items():
         assert th.equal(value, model.policy.state_dict()[key]), key
-        if not key.endswith(".weight") or "bn" in key:
+        if not key.endswith((".weight", ".weight_mask", "_extra_state")) or value.dim() == 1:
             assert th.equal(value, after[key]), key
 
 
