@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from sb3_sparse.algorithms.sac import SAC
     from sb3_sparse.algorithms.td3 import DDPG, TD3
     from sb3_sparse.callback import SparsityCallback
+    from sb3_sparse.callbacks.robust_value import RobustValueCallback
     from sb3_sparse.compress.twin import sparsify
     from sb3_sparse.policies.actor_critic import SparseActorCriticPolicy
     from sb3_sparse.policies.base import BaseSparsePolicy
@@ -53,6 +54,7 @@ __all__ = [
     "BaseSparsePolicy",
     "NetworkSpec",
     "PassCounts",
+    "RobustValueCallback",
     "SparseActorCriticPolicy",
     "SparseDQNPolicy",
     "SparsePolicy",

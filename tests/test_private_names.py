@@ -112,6 +112,7 @@ def test_sb3_has_the_names_that_are_read():
     assert of_sb3.planned_timesteps(model) == 12
     assert of_sb3.timesteps_since_start(model) == 8
     assert of_sb3.progress_remaining(model) == 0.0
+    assert of_sb3.updates_done(model) == 3 * model.n_epochs
     observation, original = of_sb3.last_observations(model)
     assert observation.shape == (1, 4)
     assert original is None  # there is no VecNormalize

@@ -88,7 +88,7 @@ class OffPolicy(Fused, OffPolicyAlgorithm):
             and {buffer.observations.dtype.name, buffer.actions.dtype.name} <= TYPES.keys()
         ):
             return IN_PLACE
-        return N_STEP if hasattr(buffer, "n_steps") else SAMPLED
+        return N_STEP if getattr(buffer, "n_steps", 1) > 1 else SAMPLED
 
     def _start_round(self) -> str:
         """Start a round of gradient steps; return how to read the replay buffer.

@@ -36,6 +36,11 @@ def timesteps_since_start(model: BaseAlgorithm) -> int:
     return model.num_timesteps - model._num_timesteps_at_start
 
 
+def updates_done(model: BaseAlgorithm) -> int:
+    """What the algorithm has counted: off-policy gradient steps, on-policy epochs."""
+    return int(model._n_updates)
+
+
 def progress_remaining(model: BaseAlgorithm) -> float:
     """What schedules go by: 1 at the start of training, 0 at its end."""
     return model._current_progress_remaining

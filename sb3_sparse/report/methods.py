@@ -15,6 +15,7 @@ NAMES = {
     "rigl": "RigL",
     "granet": "GraNet",
     "mst": "MST",
+    "rlx2": "RLx2",
 }
 
 

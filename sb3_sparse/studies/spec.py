@@ -8,7 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from sb3_sparse.callbacks import RobustValueCallback
 from sb3_sparse.errors import ConfigError, did_you_mean
+from sb3_sparse.policies.arguments import arguments_of
 from sb3_sparse.sparsity.numeric import is_whole
 from sb3_sparse.studies.blocks import (
     CHOSEN,
@@ -33,6 +35,8 @@ from sb3_sparse.zoo.configs import read_yaml
 from sb3_sparse.zoo.environments import package_names
 from sb3_sparse.zoo.settings import Names
 from sb3_sparse.zoo.spec import RunSpec
+
+OF_ROBUST_VALUE = arguments_of(RobustValueCallback) - {"verbose"}
 
 
 @dataclass(frozen=True)
@@ -160,6 +164,7 @@ def _check_varies(varies: Any, cells: Sequence[Cell], path: Path) -> None:
 
 def _check_schedule(schedule: Mapping[str, Any]) -> None:
     known = {name for method in method_names() for name in method_named(method).options}
+    known |= OF_ROBUST_VALUE
     for name in schedule:
         if name not in known:
             raise ConfigError(
@@ -192,10 +197,17 @@ def _check_choices(blocks: Sequence[Mapping[str, Any]], scale: Mapping[str, Any]
 
 
 def _with_schedule(arguments: dict[str, Any], schedule: Mapping[str, Any]) -> dict[str, Any]:
-    """Add the entries of a scale's ``schedule`` that the method takes: none for static masks."""
-    run = RunSpec(**arguments)
-    methods = run.settings().methods if schedule else None
-    if methods is None:
+    """Add the entries of a scale's ``schedule`` that the callbacks take: none for static masks."""
+    if not schedule:
         return arguments
-    taken = {name: value for name, value in schedule.items() if name in methods.options}
+    run = RunSpec(**arguments)
+    settings = run.settings()
+    options: frozenset[str] = frozenset()
+    if settings.methods is not None:
+        options |= settings.methods.options
+    if settings.robust_value is not None:
+        options |= OF_ROBUST_VALUE
+    if not options:
+        return arguments
+    taken = {name: value for name, value in schedule.items() if name in options}
     return {**arguments, "hyperparams": {**taken, **run.hyperparams}}

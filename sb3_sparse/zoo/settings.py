@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from sb3_sparse.errors import ConfigError, did_you_mean
 from sb3_sparse.policies.arguments import arguments_of, import_path
 from sb3_sparse.topology import Methods
+from sb3_sparse.zoo.callbacks import listed, robust_value_of, with_robust_value
 from sb3_sparse.zoo.configs import DENSE
 
 if TYPE_CHECKING:  # imported when settings are checked, not when names are read
@@ -117,6 +118,14 @@ class Settings(Mapping[str, Any]):
         return None if callback is None else Methods.of(callback["method"])
 
     @property
+    def robust_value(self) -> Mapping[str, Any] | None:
+        """The arguments of the RobustValueCallback; None if the settings have none.
+
+        :raises ConfigError: if they are no mapping
+        """
+        return deepcopy(robust_value_of(self._content))
+
+    @property
     def method(self) -> str:
         """The topology method; ``"static"`` without a callback, ``"dense"`` at sparsity 0.
 
@@ -138,14 +147,14 @@ class Settings(Mapping[str, Any]):
         return DENSE if all(share == 0.0 for share in shares) else "static"
 
     def changed(self, overrides: Mapping[str, Any], algorithm: type[BaseAlgorithm]) -> Settings:
-        """Return these settings with each override in its place: callback, policy or algorithm.
+        """Return these settings with each override in its place: a callback, policy or algorithm.
 
         The names do not overlap, so ``update_interval``, ``weight_decay`` and ``learning_rate``
         each find their own place. A mapping that overrides a mapping is merged into it.
 
         :param overrides: values by name
         :param algorithm: the algorithm that the settings are for
-        :raises ConfigError: for a name that none of the three has
+        :raises ConfigError: for a name that none of them has
         """
         names, content = Names.of(algorithm), self.as_dict()
         for name, value in overrides.items():
@@ -162,12 +171,15 @@ class Settings(Mapping[str, Any]):
                         f"{name} means nothing here: these settings train without {CALLBACK}"
                     )
                 found[1][name] = value
+            elif name in names.robust_value:
+                content["callback"] = with_robust_value(content, name, value)
             else:
                 raise ConfigError(
                     f"{algorithm.__name__} has no hyperparameter {name!r}"
                     f"{did_you_mean(name, names.all)}. Of the algorithm: "
                     f"{_listed(names.algorithm)}. Of the policy: {_listed(names.policy)}. Of the "
-                    f"mask's schedule: {_listed(names.schedule)}"
+                    f"mask's schedule: {_listed(names.schedule)}. Of the RobustValueCallback: "
+                    f"{_listed(names.robust_value)}"
                 )
         if "sparsity" in overrides and "initial_sparsity" not in overrides:
             self._move_start(content["policy_kwargs"])
@@ -216,7 +228,7 @@ class Settings(Mapping[str, Any]):
         :param algorithm: gives the default where the settings lack the name
         :return: the value; ``"default"`` where neither the settings nor the algorithm have one
         """
-        for place in (self.policy_kwargs, self.callback or {}, self):
+        for place in (self.policy_kwargs, self.callback or {}, self.robust_value or {}, self):
             if name in place:
                 return place[name]
         if name == "weight_decay":
@@ -243,6 +255,9 @@ class Settings(Mapping[str, Any]):
             return {name: value for name, value in values.items() if name not in hidden}
 
         parts = {"policy_kwargs": kept(self.policy_kwargs), "callback": kept(self.callback or {})}
+        robust_value = self.robust_value
+        if robust_value is not None:
+            parts["robust_value"] = kept(robust_value)
         return json.dumps({**kept(self), **parts}, sort_keys=True, default=str)
 
 
@@ -253,27 +268,31 @@ class Names:
     :param algorithm: arguments of the algorithm's constructor and of rl-zoo
     :param policy: arguments of the sparse policy
     :param schedule: arguments of the SparsityCallback, except its method
+    :param robust_value: arguments of the RobustValueCallback
     """
 
     algorithm: frozenset[str]
     policy: frozenset[str]
     schedule: frozenset[str]
+    robust_value: frozenset[str]
 
     @classmethod
     def of(cls, algorithm: type[BaseAlgorithm]) -> Names:
         """Return the names that the settings of an algorithm may hold."""
         from sb3_sparse.callback import SparsityCallback
+        from sb3_sparse.callbacks import RobustValueCallback
 
         return cls(
             (arguments_of(algorithm) - SET_BY_THE_RUN) | ZOO_KEYS,
             arguments_of(algorithm.policy_aliases[ALIAS]),
             arguments_of(SparsityCallback) - {"method", "verbose"},
+            arguments_of(RobustValueCallback) - {"verbose"},
         )
 
     @property
     def all(self) -> frozenset[str]:
-        """The names of all three owners."""
-        return self.algorithm | self.policy | self.schedule
+        """The names of all owners."""
+        return self.algorithm | self.policy | self.schedule | self.robust_value
 
 
 def _listed(names: Iterable[str]) -> str:
@@ -284,8 +303,7 @@ def _sparsity_callback(
     settings: Mapping[str, Any], imports: bool
 ) -> tuple[bool, dict[str, Any]] | None:
     """Return whether the SparsityCallback is a user's subclass, and its arguments."""
-    callbacks = settings.get("callback") or []
-    for callback in callbacks if isinstance(callbacks, list) else [callbacks]:
+    for callback in listed(settings):
         named = callback if isinstance(callback, dict) else {callback: {}}
         if len(named) != 1:
             raise ConfigError(

@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Set
 from dataclasses import fields
+from itertools import chain
 from typing import Any, cast
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_sparse.callback import SparsityCallback
+from sb3_sparse.callbacks import RobustValueCallback
 from sb3_sparse.engine.optimizers import check_weight_decay
 from sb3_sparse.errors import ConfigError, did_you_mean
 from sb3_sparse.policies.arguments import import_classes
@@ -18,6 +20,7 @@ from sb3_sparse.policies.base import BaseSparsePolicy
 from sb3_sparse.policies.config import SPARSITY_MISSING, SparsityConfig
 from sb3_sparse.topology import Methods
 from sb3_sparse.zoo.arguments import kind_of
+from sb3_sparse.zoo.callbacks import ROBUST_VALUE
 from sb3_sparse.zoo.settings import ALIAS, CALLBACK, SET_BY_THE_RUN, Names, Settings
 
 OF_SPARSITY = frozenset(one.name for one in fields(SparsityConfig))
@@ -37,9 +40,13 @@ def check_settings(settings: Settings, algorithm: type[BaseAlgorithm]) -> None:
     if callback is not None and not settings.has_own_callback:
         allowed = names.schedule | {"method", "verbose"}
         _check_keys(callback, allowed, f"{CALLBACK} has no argument", names)
-    for part in (settings, kwargs, callback or {}, kwargs.get("optimizer_kwargs") or {}):
-        for name, value in part.items():
-            _check_value(algo.lower(), name, value)
+    robust_value = settings.robust_value
+    if robust_value is not None:
+        allowed = names.robust_value | {"verbose"}
+        _check_keys(robust_value, allowed, f"{ROBUST_VALUE} has no argument", names)
+    parts = (settings, kwargs, callback, robust_value, kwargs.get("optimizer_kwargs"))
+    for name, value in chain.from_iterable((part or {}).items() for part in parts):
+        _check_value(algo.lower(), name, value)
     import_classes(dict(kwargs))
     if settings.get("noise_type") is not None and "noise_std" not in settings:
         raise ConfigError("noise_type needs noise_std, e.g. noise_std: 0.1")
@@ -57,6 +64,8 @@ def check_settings(settings: Settings, algorithm: type[BaseAlgorithm]) -> None:
     check_weight_decay(kwargs.get("weight_decay", 0.0), kwargs.get("optimizer_kwargs"))
     if callback is not None and not settings.has_own_callback:
         SparsityCallback(**callback).plans.check(networks)
+    if robust_value is not None:
+        RobustValueCallback(**robust_value)
     _check_start(kwargs, settings.methods, networks)
 
 
@@ -68,6 +77,8 @@ def _check_keys(given: Mapping[str, Any], allowed: Set[str], what: str, names: N
             cure = "; it is the policy's: put it under policy_kwargs"
         elif name in names.schedule:
             cure = f"; it is the mask's schedule's: put it under {CALLBACK}"
+        elif name in names.robust_value:
+            cure = f"; put it under {ROBUST_VALUE}"
         elif name in names.algorithm:
             cure = "; it is the algorithm's: put it beside policy_kwargs"
         elif name in SET_BY_THE_RUN:

@@ -9,8 +9,9 @@ import pytest
 from stable_baselines3 import DQN, PPO, SAC
 
 from sb3_sparse.errors import ConfigError
-from sb3_sparse.zoo.settings import CALLBACK, Settings, parse_overrides
+from sb3_sparse.zoo.settings import CALLBACK, POLICY, Settings, parse_overrides
 from sb3_sparse.zoo.spec import RunSpec
+from sb3_sparse.zoo.validation import check_settings
 
 
 def base(**more):
@@ -274,3 +275,57 @@ def test_a_setting_is_found_wherever_it_lies():
     names = ("sparsity", "update_interval", "learning_rate", "weight_decay", "distribution", "tau")
     assert [settings.value(name, SAC) for name in names] == [0.9, 7, 0.1, 0.0, "erk", 0.005]
     assert settings.value("drop_fraction", SAC) == "default"
+
+
+ROBUST = "sb3_sparse.RobustValueCallback"
+RLX2 = {
+    "policy": POLICY,
+    "policy_kwargs": {"sparsity": 0.9},
+    "callback": [{CALLBACK: {"method": "rigl"}}, {ROBUST: {"multi_step": 3}}],
+}
+
+
+@pytest.mark.parametrize("form", [ROBUST, {ROBUST: None}, {ROBUST: {}}], ids=str)
+@pytest.mark.parametrize("alone", [True, False])
+def test_arguments_of_the_robust_value_callback_find_their_place(form, alone):
+    callbacks = form if alone else [{CALLBACK: {"method": "rigl"}}, form]
+    settings = Settings({**RLX2, "callback": callbacks})
+    assert settings.robust_value == {}
+    others = {} if alone else {"update_interval": 7}
+    changed = settings.changed({"min_buffer_size": 50, **others}, SAC)
+    assert changed.robust_value == {"min_buffer_size": 50}
+    assert changed.value("min_buffer_size") == 50
+    assert changed.callback == (None if alone else {"method": "rigl", **others})
+    assert settings.robust_value == {}
+
+
+def test_runs_with_other_arguments_of_it_are_not_averaged():
+    settings = Settings(RLX2)
+    assert settings.changed({"multi_step": 3}, SAC).variant() == settings.variant()
+    other = settings.changed({"multi_step": 5}, SAC)
+    assert other.variant() != settings.variant()
+    assert other.variant(["multi_step"]) == settings.variant(["multi_step"])
+    plain = Settings({**RLX2, "callback": RLX2["callback"][:1]})
+    assert plain.robust_value is None
+    assert plain.variant() != settings.variant()
+
+
+def test_its_arguments_mean_nothing_without_it():
+    plain = Settings({**RLX2, "callback": RLX2["callback"][:1]})
+    with pytest.raises(ConfigError, match="multi_step means nothing here: .* --method rlx2"):
+        plain.changed({"multi_step": 3}, SAC)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ({"multistep": 3}, "RobustValueCallback has no argument 'multistep'.*'multi_step'"),
+        ({"multi_step": 0}, "multi_step must be a whole number, 1 or more, got 0"),
+        ({"multi_step_begin": "1e-1"}, "the text '1e-1', as YAML reads a number"),
+        ([3], "takes a mapping of arguments"),
+    ],
+)
+def test_its_arguments_are_checked_before_training(arguments, said):
+    settings = Settings({**RLX2, "callback": [RLX2["callback"][0], {ROBUST: arguments}]})
+    with pytest.raises(ConfigError, match=said):
+        check_settings(settings, SAC)

@@ -1,0 +1,5 @@
+"""Replay buffers."""
+
+from sb3_sparse.buffers.dynamic import DynamicReplayBuffer
+
+__all__ = ["DynamicReplayBuffer"]
