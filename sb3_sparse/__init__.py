@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     from sb3_sparse.algorithms.sac import SAC
     from sb3_sparse.algorithms.td3 import DDPG, TD3
     from sb3_sparse.callback import SparsityCallback
+    from sb3_sparse.callbacks.recycle import RecycleDormantCallback
+    from sb3_sparse.callbacks.reset import ResetCallback
     from sb3_sparse.callbacks.robust_value import RobustValueCallback
     from sb3_sparse.compress.twin import sparsify
     from sb3_sparse.policies.actor_critic import SparseActorCriticPolicy
@@ -54,6 +56,8 @@ __all__ = [
     "BaseSparsePolicy",
     "NetworkSpec",
     "PassCounts",
+    "RecycleDormantCallback",
+    "ResetCallback",
     "RobustValueCallback",
     "SparseActorCriticPolicy",
     "SparseDQNPolicy",

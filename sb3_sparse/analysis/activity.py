@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -50,10 +51,12 @@ class Activity:
 
     :param activations: mean absolute activation of every unit, by layer
     :param features: inputs of each output layer, shape ``(observations, dim)``
+    :param names: dotted name of the activation function of each of ``activations``
     """
 
     activations: list[NDArray[np.float64]] = field(default_factory=list)
     features: list[NDArray[np.float64]] = field(default_factory=list)
+    names: list[str] = field(default_factory=list)
 
     def dormant(self, tau: float) -> NDArray[np.bool_]:
         """Whether each unit is ``tau``-dormant, for all layers together."""
@@ -152,7 +155,7 @@ def activity(
     model = unwrapped(model)
     policy = model if isinstance(model, BasePolicy) else unwrapped(model.policy)
     twin = dense_twin(policy)
-    tensors = _tensors(twin, observations)
+    tensors = tensors_of(twin, observations)
     count = len(pytree.tree_leaves(tensors)[0])
     if actions is not None:
         actions = th.as_tensor(actions, dtype=th.float32, device=policy.device)
@@ -166,18 +169,24 @@ def activity(
         seen.update(map(id, modules.values()))
         heads = output_layers(spec, list(prunable_of(twin, spec)))
         watched = _Watched(
-            [m for m in modules.values() if type(m).__module__ == "torch.nn.modules.activation"],
+            {name: m for name, m in modules.items() if is_activation(m)},
             [twin.get_submodule(name) for name in sorted(heads)],
         )
         with th.no_grad():
             for part in _parts(tensors, actions, count):
-                _run(twin, network, *part)
+                run_network(twin, network, *part)
                 watched.end_part()
         found[network] = watched.remove(count)
     return found
 
 
-def _tensors(policy: BasePolicy, observations: Any) -> Any:
+def is_activation(module: nn.Module) -> bool:
+    """Whether a module is an activation function, whose results are units."""
+    return type(module).__module__ == "torch.nn.modules.activation"
+
+
+def tensors_of(policy: BasePolicy, observations: Any) -> Any:
+    """Observations as tensors, from any form that :func:`activity` takes."""
     leaves = pytree.tree_leaves(observations)
     if leaves and all(isinstance(leaf, th.Tensor) for leaf in leaves):
         return pytree.tree_map(lambda leaf: leaf.to(policy.device), observations)
@@ -191,7 +200,12 @@ def _parts(tensors: Any, actions: Any, count: int) -> Iterator[tuple[Any, Any]]:
         yield observations, None if actions is None else actions[here]
 
 
-def _run(policy: Any, network: str, observations: Any, actions: Any) -> None:
+def run_network(policy: Any, network: str, observations: Any, actions: Any) -> None:
+    """Run one network of a policy.
+
+    :param observations: tensors
+    :param actions: for critics of actions; None: the actor's
+    """
     if isinstance(policy, ActorCriticPolicy):
         if network == "actor":
             policy.get_distribution(observations)
@@ -210,19 +224,24 @@ def _run(policy: Any, network: str, observations: Any, actions: Any) -> None:
 class _Watched:
     """Hooks that sum up a twin's activations during the passes of one network.
 
-    :param activations: activation functions
+    :param activations: activation functions by name
     :param heads: output layers
     """
 
-    def __init__(self, activations: list[nn.Module], heads: list[nn.Module]) -> None:
+    def __init__(self, activations: dict[str, nn.Module], heads: list[nn.Module]) -> None:
         self.sums: list[th.Tensor] = []
         self.features: list[list[th.Tensor]] = []
         self.part: list[th.Tensor] = []
         self.inputs: list[th.Tensor] = []
-        self.handles = [m.register_forward_hook(self._activated) for m in activations]
+        self.called: list[str] = []
+        self.handles = [
+            module.register_forward_hook(partial(self._activated, name))
+            for name, module in activations.items()
+        ]
         self.handles += [m.register_forward_pre_hook(self._entered) for m in heads]
 
-    def _activated(self, module: nn.Module, inputs: Any, output: th.Tensor) -> None:
+    def _activated(self, name: str, module: nn.Module, inputs: Any, output: th.Tensor) -> None:
+        self.called.append(name)
         size = output.abs().double().flatten(2) if output.dim() > 2 else output.abs().double()
         self.part.append((size.mean(dim=2) if size.dim() > 2 else size).sum(dim=0))
 
@@ -243,4 +262,5 @@ class _Watched:
         for handle in self.handles:
             handle.remove()
         features = [th.cat(parts).numpy() for parts in zip(*self.features, strict=True)]
-        return Activity([(total / count).cpu().numpy() for total in self.sums], features)
+        means = [(total / count).cpu().numpy() for total in self.sums]
+        return Activity(means, features, self.called[: len(means)])

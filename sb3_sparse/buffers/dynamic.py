@@ -61,17 +61,17 @@ class DynamicReplayBuffer(NStepReplayBuffer):
         self._begin(stored=0)
 
     @classmethod
-    def from_buffer(cls, buffer: ReplayBuffer) -> DynamicReplayBuffer:
+    def from_buffer(cls, buffer: ReplayBuffer | None) -> DynamicReplayBuffer:
         """Make one of SB3's replay buffer. It takes the arrays over: discard the other.
 
         :param buffer: SB3's ``ReplayBuffer``, of which no subclass will do
         :raises ConfigError: for another class, or with ``optimize_memory_usage``
         """
         if type(buffer) is not ReplayBuffer or buffer.optimize_memory_usage:
+            memory = " with it" if getattr(buffer, "optimize_memory_usage", False) else ""
             raise ConfigError(
                 "a DynamicReplayBuffer can be made of SB3's ReplayBuffer without "
-                f"optimize_memory_usage, got {type(buffer).__name__}"
-                f"{' with it' if buffer.optimize_memory_usage else ''}"
+                f"optimize_memory_usage, got {type(buffer).__name__}{memory}"
             )
         made = cls.__new__(cls)
         vars(made).update(vars(buffer), n_steps=1, gamma=0.99)

@@ -7,16 +7,16 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_sparse.buffers import DynamicReplayBuffer
+from sb3_sparse.callbacks.interval import IntervalCallback, check_whole
 from sb3_sparse.errors import ConfigError
-from sb3_sparse.policies.internals import planned_timesteps, updates_done
-from sb3_sparse.sparsity.numeric import is_number, is_whole
+from sb3_sparse.policies.internals import planned_timesteps
+from sb3_sparse.sparsity.numeric import is_number
 
 
-class RobustValueCallback(BaseCallback):
+class RobustValueCallback(IntervalCallback):
     """Learns from returns over several steps, and forgets experience of policies long gone.
 
     Beside ``SparsityCallback("rigl")`` this is RLx2. It is for SAC, TD3, DDPG and TQC, whether
@@ -69,8 +69,6 @@ class RobustValueCallback(BaseCallback):
     Source: arXiv:2205.15043, section 4.2.
     """
 
-    model: OffPolicyAlgorithm
-
     def __init__(
         self,
         *,
@@ -82,16 +80,13 @@ class RobustValueCallback(BaseCallback):
         oldest: int = 2048,
         verbose: int = 0,
     ) -> None:
-        super().__init__(verbose)
-        counts = {
-            "multi_step": multi_step,
-            "check_interval": check_interval,
-            "min_buffer_size": min_buffer_size,
-            "oldest": oldest,
-        }
-        for name, value in counts.items():
-            if not is_whole(value) or value < 1:
-                raise ConfigError(f"{name} must be a whole number, 1 or more, got {value!r}")
+        check_whole(
+            multi_step=multi_step,
+            check_interval=check_interval,
+            min_buffer_size=min_buffer_size,
+            oldest=oldest,
+        )
+        super().__init__(check_interval, verbose)
         if not is_number(multi_step_begin) or not 0 <= multi_step_begin <= 1:
             raise ConfigError(
                 "multi_step_begin is a fraction of training and must lie in [0, 1], got "
@@ -103,7 +98,6 @@ class RobustValueCallback(BaseCallback):
             )
         self.multi_step = multi_step
         self.multi_step_begin = multi_step_begin
-        self.check_interval = check_interval
         self.distance_threshold = distance_threshold
         self.min_buffer_size = min_buffer_size
         self.oldest = oldest
@@ -135,14 +129,8 @@ class RobustValueCallback(BaseCallback):
         self.buffer.gamma = model.gamma
 
     def _on_training_start(self) -> None:
-        self._checked = updates_done(self.model)
+        super()._on_training_start()
         self._store_means(None)
-
-    def _on_rollout_start(self) -> None:
-        self._check_if_due()
-
-    def _on_step(self) -> bool:
-        return True
 
     def _on_rollout_end(self) -> None:
         self._store_means(self.model.num_timesteps)
@@ -156,7 +144,7 @@ class RobustValueCallback(BaseCallback):
     def _on_training_end(self) -> None:
         # Of a rollout that a callback stopped, the last step was taken but not stored.
         self._store_means(self.model.num_timesteps - self.model.n_envs)
-        self._check_if_due()
+        self._act_if_due()
 
     def _store_means(self, timesteps: int | None) -> None:
         """Store the action means of the rows that have none yet.
@@ -188,18 +176,12 @@ class RobustValueCallback(BaseCallback):
         scaled: NDArray[np.float32] = policy.scale_action(actions)
         return scaled.reshape(len(rows), self.buffer.n_envs, self.buffer.action_dim)
 
-    def _check_if_due(self) -> None:
-        done = updates_done(self.model)
-        if done // self.check_interval > self._checked // self.check_interval and (
-            self.buffer.size()
-        ):
-            self._check()
-        self._checked = done
-
-    def _check(self) -> None:
+    def act(self, step: int) -> None:
         """Forget the oldest transitions while the policies part, and log their distance."""
         buffer = self.buffer
         block, least = (-(-n // buffer.n_envs) for n in (self.oldest, self.min_buffer_size))
+        if not buffer.size():
+            return
         first = distance = self._distance(block)
         while distance > self.distance_threshold and buffer.size() > least:
             buffer.shrink(min(block, buffer.size() - least))

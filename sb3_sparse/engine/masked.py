@@ -38,6 +38,19 @@ def clear(weight: th.Tensor, mask: th.Tensor) -> None:
         weight.data.mul_(mask)
 
 
+def clear_moments(
+    weight: nn.Parameter, where: NDArray[np.bool_], optimizers: Sequence[th.optim.Optimizer]
+) -> None:
+    """Set the moments of some entries of a parameter to 0.
+
+    :param where: which entries, as many as the parameter has
+    """
+    places = th.from_numpy(where).view(weight.shape).to(weight.device)
+    for _, _, value in moments_of(optimizers, weight):
+        if value.shape == weight.shape:
+            value.masked_fill_(places, 0.0)
+
+
 class MaskedStorage(LayerStorage):
     """Keeps a layer as its dense weight, 0 where inactive, and a boolean mask.
 
@@ -170,6 +183,13 @@ class MaskedStorage(LayerStorage):
                 state[key] = th.zeros_like(self.weight)
                 state[key][self.module.get_buffer(MASK_KEY)] = value
         self.moments_stale = False
+
+    def clear_moments(
+        self, where: NDArray[np.bool_], optimizers: Sequence[th.optim.Optimizer]
+    ) -> None:
+        if self.moments_stale:
+            self.settle_moments(optimizers)
+        clear_moments(self.weight, where, optimizers)
 
     @property
     def connections(self) -> object:

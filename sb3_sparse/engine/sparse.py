@@ -93,6 +93,16 @@ class SparseStorage(LayerStorage):
         self._structure = structure
         self.moments_stale = False
 
+    def clear_moments(
+        self, where: NDArray[np.bool_], optimizers: Sequence[th.optim.Optimizer]
+    ) -> None:
+        if self.moments_stale:
+            self.settle_moments(optimizers)
+        places = th.from_numpy(where[self._structure.flat])
+        for _, _, value in moments_of(optimizers, self.weight):
+            if value.shape == places.shape:
+                value.masked_fill_(places, 0.0)
+
     @property
     def connections(self) -> object:
         return self.module.structure

@@ -170,6 +170,15 @@ class LayerStorage(ABC):
     def settle_moments(self, optimizers: Sequence[th.optim.Optimizer]) -> None:
         """Bring the optimizers' moments in line with mask and storage."""
 
+    @abstractmethod
+    def clear_moments(
+        self, where: NDArray[np.bool_], optimizers: Sequence[th.optim.Optimizer]
+    ) -> None:
+        """Set the moments of some weights to 0.
+
+        :param where: which weights, shape ``(size,)``
+        """
+
     @property
     @abstractmethod
     def connections(self) -> object:

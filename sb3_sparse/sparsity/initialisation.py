@@ -53,7 +53,7 @@ def glorot_limits(mask: NDArray[np.bool_], gain: float = 1.0) -> NDArray[np.floa
 
 
 def sparsity_aware_weights(
-    mask: NDArray[np.bool_], seed: int, name: str, gain: float = 1.0
+    mask: NDArray[np.bool_], seed: int, name: str, gain: float = 1.0, number: int = 0
 ) -> NDArray[np.float32]:
     """Draw Glorot uniform weights for a sparse layer, 0 where inactive.
 
@@ -61,6 +61,7 @@ def sparsity_aware_weights(
     :param seed: mask seed
     :param name: the layer's name
     :param gain: SB3's gain for the layer; 1 if it has none
+    :param number: distinguishes draws of one layer, e.g. the gradient step; 0: the first
     """
-    draws = random_uniform(seed, f"{name}/weight", mask.size).reshape(mask.shape)
+    draws = random_uniform(seed, f"{name}/weight", mask.size, number).reshape(mask.shape)
     return np.where(mask, draws * glorot_limits(mask, gain), 0.0).astype(np.float32)

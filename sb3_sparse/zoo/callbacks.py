@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from sb3_sparse.errors import ConfigError
@@ -16,11 +16,8 @@ def robust_value_of(settings: Mapping[str, Any]) -> dict[str, Any] | None:
     :param settings: in rl-zoo's form: a callback is a path, or a path with its arguments
     :raises ConfigError: if the arguments are no mapping
     """
-    for callback in listed(settings):
-        if callback == ROBUST_VALUE:
-            return {}
-        if isinstance(callback, Mapping) and ROBUST_VALUE in callback:
-            arguments = callback[ROBUST_VALUE] or {}
+    for path, arguments in named(settings):
+        if path == ROBUST_VALUE:
             if not isinstance(arguments, Mapping):
                 raise ConfigError(
                     f"{ROBUST_VALUE} takes a mapping of arguments, e.g. {{multi_step: 3}}, got "
@@ -47,6 +44,13 @@ def with_robust_value(settings: Mapping[str, Any], name: str, value: Any) -> lis
         else callback
         for callback in listed(settings)
     ]
+
+
+def named(settings: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    """Yield the path and the arguments of each callback."""
+    for callback in listed(settings):
+        for path, arguments in ({callback: {}} if isinstance(callback, str) else callback).items():
+            yield path, arguments or {}
 
 
 def listed(settings: Mapping[str, Any]) -> list[Any]:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from sb3_sparse.errors import ConfigError, did_you_mean
 from sb3_sparse.policies.arguments import arguments_of, import_path
 from sb3_sparse.topology import Methods
-from sb3_sparse.zoo.callbacks import listed, robust_value_of, with_robust_value
+from sb3_sparse.zoo.callbacks import listed, named, robust_value_of, with_robust_value
 from sb3_sparse.zoo.configs import DENSE
 
 if TYPE_CHECKING:  # imported when settings are checked, not when names are read
@@ -254,10 +254,15 @@ class Settings(Mapping[str, Any]):
         def kept(values: Mapping[str, Any]) -> dict[str, Any]:
             return {name: value for name, value in values.items() if name not in hidden}
 
-        parts = {"policy_kwargs": kept(self.policy_kwargs), "callback": kept(self.callback or {})}
-        robust_value = self.robust_value
-        if robust_value is not None:
-            parts["robust_value"] = kept(robust_value)
+        sparsity = self.callback
+        parts = {"policy_kwargs": kept(self.policy_kwargs), "callback": kept(sparsity or {})}
+        others = {
+            path: kept(given) if isinstance(given, Mapping) else given
+            for path, given in named(self._content)
+            if given != sparsity
+        }
+        if others:
+            parts["callbacks"] = others
         return json.dumps({**kept(self), **parts}, sort_keys=True, default=str)
 
 

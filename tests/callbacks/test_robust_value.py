@@ -199,7 +199,7 @@ def test_a_distance_at_the_threshold_is_no_more_than_it():
 def test_a_comparison_is_due_when_gradient_steps_pass_a_multiple():
     model, callback = zero_policy()
     counted = []
-    callback._check = lambda: counted.append(model._n_updates)
+    callback.act = counted.append
     for done in (9, 10, 11, 19, 35, 36, 40):
         model._n_updates = done
         callback.on_rollout_start()

@@ -329,3 +329,12 @@ def test_its_arguments_are_checked_before_training(arguments, said):
     settings = Settings({**RLX2, "callback": [RLX2["callback"][0], {ROBUST: arguments}]})
     with pytest.raises(ConfigError, match=said):
         check_settings(settings, SAC)
+
+
+def test_further_callbacks_tell_runs_apart():
+    reset = {"sb3_sparse.ResetCallback": {"interval": 10}}
+    settings = Settings({**RLX2, "callback": [RLX2["callback"][0], reset]})
+    plain = Settings({**RLX2, "callback": RLX2["callback"][:1]})
+    other = Settings({**RLX2, "callback": [{"sb3_sparse.ResetCallback": {"interval": 20}}]})
+    assert len({one.variant() for one in (settings, plain, other)}) == 3
+    assert settings.callback == {"method": "rigl"}

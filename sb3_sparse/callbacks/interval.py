@@ -1,0 +1,72 @@
+"""The base class of callbacks that act between rounds of gradient steps."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+
+from sb3_sparse.errors import ConfigError
+from sb3_sparse.policies.internals import updates_done
+from sb3_sparse.sparsity.numeric import is_whole
+
+
+class IntervalCallback(BaseCallback):
+    """Acts each time that gradient steps have passed a multiple of an interval.
+
+    It acts at the start of the rollout after the step that is due, so before a checkpoint of that
+    moment is saved. It knows when to act from the steps that the algorithm has counted, and so
+    does a resumed training.
+
+    :param interval: gradient steps between two actions
+    :param verbose: as in SB3
+    :raises ConfigError: if it is no whole number, 1 or more
+    """
+
+    model: OffPolicyAlgorithm
+
+    def __init__(self, interval: int, verbose: int = 0) -> None:
+        super().__init__(verbose)
+        self.interval = interval
+        check_whole(interval=interval)
+
+    @abstractmethod
+    def act(self, step: int) -> None:
+        """Act.
+
+        :param step: gradient steps that the algorithm has taken
+        """
+
+    def _init_callback(self) -> None:
+        if not isinstance(self.model, OffPolicyAlgorithm):
+            raise ConfigError(
+                f"{type(self).__name__} is for algorithms with a replay buffer, such as DQN, SAC "
+                f"and TD3, got {type(self.model).__name__}"
+            )
+
+    def _on_training_start(self) -> None:
+        self._done = updates_done(self.model)
+
+    def _on_rollout_start(self) -> None:
+        self._act_if_due()
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _act_if_due(self) -> None:
+        done = updates_done(self.model)
+        due = done // self.interval > self._done // self.interval
+        self._done = done
+        if due:
+            self.act(done)
+
+
+def check_whole(**values: object) -> None:
+    """Check that values are whole numbers, 1 or more.
+
+    :raises ConfigError: naming the first that is not
+    """
+    for name, value in values.items():
+        if not is_whole(value) or value < 1:  # type: ignore[operator]
+            raise ConfigError(f"{name} must be a whole number, 1 or more, got {value!r}")
