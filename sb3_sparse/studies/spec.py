@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sb3_sparse.callbacks import RobustValueCallback
 from sb3_sparse.errors import ConfigError, did_you_mean
 from sb3_sparse.policies.arguments import arguments_of
 from sb3_sparse.sparsity.numeric import is_whole
@@ -35,8 +34,6 @@ from sb3_sparse.zoo.configs import read_yaml
 from sb3_sparse.zoo.environments import package_names
 from sb3_sparse.zoo.settings import Names
 from sb3_sparse.zoo.spec import RunSpec
-
-OF_ROBUST_VALUE = arguments_of(RobustValueCallback) - {"verbose"}
 
 
 @dataclass(frozen=True)
@@ -164,13 +161,19 @@ def _check_varies(varies: Any, cells: Sequence[Cell], path: Path) -> None:
 
 def _check_schedule(schedule: Mapping[str, Any]) -> None:
     known = {name for method in method_names() for name in method_named(method).options}
-    known |= OF_ROBUST_VALUE
+    known |= _of_robust_value()
     for name in schedule:
         if name not in known:
             raise ConfigError(
                 f"schedule has {name!r}, which no method takes{did_you_mean(name, known)}; allowed "
                 f"are {', '.join(sorted(known))}"
             )
+
+
+def _of_robust_value() -> frozenset[str]:
+    from sb3_sparse.callbacks import RobustValueCallback  # which imports torch
+
+    return arguments_of(RobustValueCallback) - {"verbose"}
 
 
 def _check_choices(blocks: Sequence[Mapping[str, Any]], scale: Mapping[str, Any]) -> None:
@@ -206,7 +209,7 @@ def _with_schedule(arguments: dict[str, Any], schedule: Mapping[str, Any]) -> di
     if settings.methods is not None:
         options |= settings.methods.options
     if settings.robust_value is not None:
-        options |= OF_ROBUST_VALUE
+        options |= _of_robust_value()
     if not options:
         return arguments
     taken = {name: value for name, value in schedule.items() if name in options}

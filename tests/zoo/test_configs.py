@@ -292,3 +292,33 @@ def test_all_environments_of_the_paper_exist():
     RunSpec(env_id="PongNoFrameskip-v4")  # registers the games
     for env_id in (*paper.CLASSIC, *MUJOCO_IDS, *GAME_IDS):
         assert env_id in gym.registry
+
+
+# Table 2 of arXiv:2205.15043 and its published code: sparsities of actor and critic.
+RLX2 = {
+    "sac": {"HalfCheetah": (0.9, 0.8), "Hopper": (0.98, 0.95), "Walker2d": (0.9, 0.9),
+            "Ant": (0.9, 0.75)},
+    "td3": {"HalfCheetah": (0.9, 0.85), "Hopper": (0.98, 0.95), "Walker2d": (0.97, 0.95),
+            "Ant": (0.96, 0.88)},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("algo", RLX2)
+@pytest.mark.parametrize("version", ["v5", "v4"])
+def test_rlx2_is_as_in_its_paper(algo, version):
+    for name, (actor, critic) in RLX2[algo].items():
+        run = RunSpec(algo, f"{name}-{version}", method="rlx2")
+        settings = run.settings()
+        assert settings.policy_kwargs["sparsity"] == {"actor": actor, "critic": critic}
+        assert settings.policy_kwargs["distribution"] == "er"
+        assert settings.callback == {
+            "method": "rigl", "update_interval": 10_000, "drop_fraction": 0.5, "end": 1.0,
+        }  # fmt: skip
+        assert settings.robust_value == {
+            "multi_step": 3, "multi_step_begin": 0.1, "check_interval": 10_000,
+            "distance_threshold": 0.2, "min_buffer_size": 200_000, "oldest": 2048,
+        }  # fmt: skip
+        assert_has(settings, {"n_timesteps": 3_000_000, "buffer_size": 3_000_000,
+                              "learning_starts": 25_000, "learning_rate": 3e-4,
+                              "batch_size": 256})  # fmt: skip
+        assert run.preset == "rlx2"
