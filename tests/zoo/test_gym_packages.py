@@ -7,12 +7,13 @@ import pickle
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import gymnasium as gym
 import pytest
 import yaml
 
-from sb3_sparse.cli.common import values_and_packages
+from sb3_sparse.cli.common import run_spec
 from sb3_sparse.compress import compress_model
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.export import export_policy
@@ -251,11 +252,15 @@ def test_ids_without_a_package_stay_as_they_are():
     assert plain_id("ALE/Pong-v5") == ("ALE/Pong-v5", ())
 
 
+def spec_of(words, values, packages):
+    return run_spec(SimpleNamespace(args=words), "dqn", "CartPole-v1", values, packages)
+
+
 def test_several_words_follow_gym_packages_and_hyperparams_in_any_order():
-    words = ["b:2", "two_envs", "c:3"]
-    values, packages = values_and_packages(words, ["a:1"], ["one_envs"])
-    assert values == ["a:1", "b:2", "c:3"]
-    assert packages == ["one_envs", "two_envs"]
-    for extra, values, packages in ((["x"], [], []), (["a:1"], [], ["one_envs"])):
+    words = ["gamma:0.9", "json", "tau:0.5"]
+    spec = spec_of(words, ["batch_size:8"], ["colorsys"])
+    assert spec.hyperparams == {"batch_size": 8, "gamma": 0.9, "tau": 0.5}
+    assert spec.gym_packages == ("colorsys", "json")
+    for words, values, packages in ((["x"], [], []), (["batch_size:1"], [], ["colorsys"])):
         with pytest.raises(ConfigError, match="unexpected argument"):
-            values_and_packages(extra, values, packages)
+            spec_of(words, values, packages)
