@@ -218,6 +218,16 @@ def test_enjoy_of_what_is_no_run(mistake):
         ("yaml", [], "sb3-sparse[zoo]"),
         ("ale_py", ["--env", "PongNoFrameskip-v4"], "PongNoFrameskip-v4 needs sb3-sparse[atari]"),
         ("cv2", ["--env", "PongNoFrameskip-v4"], "PongNoFrameskip-v4 needs sb3-sparse[atari]"),
+        (
+            "shimmy",
+            ["--env", "dm_control/dog-run-v0"],
+            "dm_control/dog-run-v0 needs sb3-sparse[dmc]",
+        ),
+        (
+            "dm_control",
+            ["--env", "dm_control/dog-run-v0"],
+            "dm_control/dog-run-v0 needs sb3-sparse[dmc]",
+        ),
         ("mujoco", ["--algo", "sac", "--env", "Ant-v5"], "Ant-v5 needs sb3-sparse[mujoco]"),
         ("tensorboard", ["-tb", "tb"], "pip install tensorboard"),
     ],

@@ -1,5 +1,6 @@
 """Gymnasium wrappers."""
 
 from sb3_sparse.wrappers.noise import ObservationNoise, PixelNoise
+from sb3_sparse.wrappers.repeat import ActionRepeat
 
-__all__ = ["ObservationNoise", "PixelNoise"]
+__all__ = ["ActionRepeat", "ObservationNoise", "PixelNoise"]

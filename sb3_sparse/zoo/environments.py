@@ -14,8 +14,10 @@ import gymnasium as gym
 
 from sb3_sparse.errors import ConfigError, MissingExtra, did_you_mean, place_of
 from sb3_sparse.policies.registry import registered
+from sb3_sparse.zoo.deepmind import PREFIX, register_dm_control
 
 ATARI = "Atari"
+DM_CONTROL = "DeepMind Control"
 CLASSIC_CONTROL = ("CartPole", "Acrobot", "MountainCar", "MountainCarContinuous", "Pendulum")
 MUJOCO = (
     "Ant",
@@ -112,21 +114,30 @@ def _failed(name: str, error: Exception) -> ConfigError:
     )
 
 
+def register_suite(env_id: str) -> bool:
+    """Register the suite of an environment, and return whether all that it needs is installed."""
+    has_atari = register_atari()
+    suite = suite_of(env_id)
+    if suite == DM_CONTROL:
+        return register_dm_control()
+    return suite != ATARI or (has_atari and importlib.util.find_spec("cv2") is not None)
+
+
 def known_environment(env_id: str) -> None:
     """Raise if an environment does not exist.
 
     :raises ConfigError: if Gymnasium has no environment of this id
-    :raises MissingExtra: if it is an Atari game, and ale-py or OpenCV is not installed
+    :raises MissingExtra: if it is an Atari game, and ale-py or OpenCV is not installed, or a task
+        of dm_control, and it or shimmy is not installed
     """
-    has_atari = register_atari()
-    if suite_of(env_id) == ATARI and not (has_atari and importlib.util.find_spec("cv2")):
-        raise MissingExtra(env_id, "atari")
+    if not register_suite(env_id):
+        raise MissingExtra(env_id, "atari" if suite_of(env_id) == ATARI else "dmc")
     if env_id not in gym.registry:
         raise ConfigError(
             f"unknown environment {env_id!r}"
             + (did_you_mean(env_id, gym.registry) or "; give a Gymnasium id")
             + "; --gym-packages names a module that registers your own environments"
-            + ("" if has_atari else " (Atari games need sb3-sparse[atari])")
+            + ("" if register_atari() else " (Atari games need sb3-sparse[atari])")
         )
 
 
@@ -145,6 +156,8 @@ def suite_of(env_id: str) -> str:
     """Return a task's benchmark by its name; the task need not be registered."""
     if env_id.startswith("ALE/") or "NoFrameskip" in env_id or "Deterministic" in env_id:
         return ATARI
+    if env_id.startswith(PREFIX):
+        return DM_CONTROL
     if game_of(env_id) in CLASSIC_CONTROL:
         return "classic control"
     return "MuJoCo" if game_of(env_id) in MUJOCO else "other tasks"

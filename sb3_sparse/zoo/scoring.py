@@ -73,6 +73,11 @@ def enjoy(
     """
     if episodes < 1:
         raise ConfigError(f"episodes must be 1 or more, got {episodes}")
+    if video and sys.platform == "linux" and not os.environ.get("DISPLAY"):
+        # They let MuJoCo render and pygame draw without a display. dm_control reads the first when
+        # it is imported, i.e. when the environment is looked up.
+        os.environ.setdefault("MUJOCO_GL", "egl")
+        os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
     saved = SavedModel.find(
         path,
         best=best,
@@ -84,9 +89,6 @@ def enjoy(
     saved.environment  # noqa: B018  # rejected before anything is made
     if video and importlib.util.find_spec("moviepy") is None:
         raise MissingExtra("recording a video", "video")
-    if video and sys.platform == "linux" and not os.environ.get("DISPLAY"):
-        os.environ.setdefault("MUJOCO_GL", "egl")  # lets MuJoCo render without a display
-        os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # lets pygame draw without one
     set_random_seed(seed)
     kwargs: dict[str, Any] = {"render_mode": "rgb_array"} if video else {}
     env = saved.envs(1, seed, env_kwargs=kwargs)

@@ -24,6 +24,7 @@ from sb3_sparse.zoo.environments import (
     known_environment,
     package_names,
     plain_id,
+    register_suite,
 )
 from sb3_sparse.zoo.settings import Settings
 
@@ -137,6 +138,7 @@ class RunSpec:
         """Unpickle in a worker, where the environment may not be registered yet."""
         vars(self).update(state)
         import_packages(self.gym_packages)
+        register_suite(self.env_id)
 
     @property
     def algorithm(self) -> type[BaseAlgorithm]:
