@@ -202,6 +202,20 @@ def supported_algorithms() -> dict[str, type[BaseAlgorithm]]:
     return {name: one.algorithm for name, one in registered().items()}
 
 
+def policy_named(algorithm: type[BaseAlgorithm], alias: str) -> type[BaseSparsePolicy]:
+    """The sparse policy of an algorithm.
+
+    :param alias: e.g. ``"SparseSimbaPolicy"``
+    :raises ConfigError: naming the algorithms that have it, if this one does not
+    """
+    policy: Any = algorithm.policy_aliases.get(alias)
+    if policy is None:
+        able = [name for name, one in supported_algorithms().items() if alias in one.policy_aliases]
+        raise ConfigError(f"{algorithm.__name__} has no {alias}; it is there for {', '.join(able)}")
+    found: type[BaseSparsePolicy] = policy
+    return found
+
+
 def lineage(algo: str) -> list[str]:
     """Lower-case names of an algorithm and of the classes that it inherits from.
 

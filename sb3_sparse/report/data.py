@@ -102,7 +102,8 @@ class RunData:
         """Algorithm, architecture and suite; runs of one family are compared."""
         extractor = str(self.settings.policy_kwargs.get("features_extractor_class", ""))
         resnet = " with the Impala ResNet" if "impala" in extractor.lower() else ""
-        return f"{self.algo.upper()}{resnet} on {suite_of(self.env_id)}"
+        simba = " with SimBa networks" if "Simba" in str(self.settings.get("policy")) else ""
+        return f"{self.algo.upper()}{resnet}{simba} on {suite_of(self.env_id)}"
 
     @cached_property
     def label(self) -> str:

@@ -14,7 +14,6 @@ from stable_baselines3.common.preprocessing import is_image_space
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.policies.base import BaseSparsePolicy
 from sb3_sparse.policies.internals import no_schedule
-from sb3_sparse.policies.registry import SparsePolicy
 from sb3_sparse.sparsity.widths import equivalent_widths
 from sb3_sparse.zoo.settings import Settings
 
@@ -92,9 +91,8 @@ def untrained_policy(
     kwargs = settings.policy_kwargs
     if settings.get("use_sde"):
         kwargs["use_sde"] = True
-    policy_class: Any = algorithm.policy_aliases[SparsePolicy]
-    policy = policy_class(observation_space, action_space, no_schedule, **kwargs)
-    assert isinstance(policy, BaseSparsePolicy)
+    policy_class: Any = settings.policy_class(algorithm)
+    policy: BaseSparsePolicy = policy_class(observation_space, action_space, no_schedule, **kwargs)
     return policy
 
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from sb3_sparse.errors import ConfigError, did_you_mean
 from sb3_sparse.policies.arguments import arguments_of, import_path
+from sb3_sparse.policies.registry import SparsePolicy, SparseSimbaPolicy, policy_named
 from sb3_sparse.topology import Methods
 from sb3_sparse.zoo.callbacks import listed, named, robust_value_of, with_robust_value
 from sb3_sparse.zoo.configs import DENSE
@@ -20,8 +21,10 @@ from sb3_sparse.zoo.configs import DENSE
 if TYPE_CHECKING:  # imported when settings are checked, not when names are read
     from stable_baselines3.common.base_class import BaseAlgorithm
 
-POLICY = "sb3_sparse.SparsePolicy"
-ALIAS = "SparsePolicy"
+    from sb3_sparse.policies.base import BaseSparsePolicy
+
+POLICIES = {f"sb3_sparse.{alias}": alias for alias in (SparsePolicy, SparseSimbaPolicy)}
+"""The sparse policies that settings may name, as a dotted path or by the alias."""
 CALLBACK = "sb3_sparse.SparsityCallback"
 ZOO_KEYS = frozenset(
     {
@@ -94,6 +97,28 @@ class Settings(Mapping[str, Any]):
         return kwargs
 
     @property
+    def alias(self) -> str:
+        """The name by which algorithms know the policy, e.g. ``"SparsePolicy"``.
+
+        :raises ConfigError: if the policy is not sparse
+        """
+        policy = self.get("policy")
+        alias = POLICIES.get(str(policy), policy)
+        if alias not in POLICIES.values():
+            raise ConfigError(
+                f"the policy must be {' or '.join(POLICIES)} (with sparsity 0.0 for dense "
+                f"training), got {policy!r}"
+            )
+        return str(alias)
+
+    def policy_class(self, algorithm: type[BaseAlgorithm]) -> type[BaseSparsePolicy]:
+        """Return the class that an algorithm makes the policy of.
+
+        :raises ConfigError: if the policy is not sparse, or if the algorithm does not have it
+        """
+        return policy_named(algorithm, self.alias)
+
+    @property
     def callback(self) -> Mapping[str, Any] | None:
         """The arguments of the SparsityCallback; None if the settings have none.
 
@@ -133,12 +158,7 @@ class Settings(Mapping[str, Any]):
 
         :raises ConfigError: if the policy is not sparse
         """
-        policy = self.get("policy")
-        if policy not in (POLICY, ALIAS):
-            raise ConfigError(
-                f"the policy must be {POLICY} (with sparsity 0.0 for dense training), got "
-                f"{policy!r}"
-            )
+        self.alias  # noqa: B018  # rejects a policy that is not sparse
         methods = self.methods
         if methods is not None:
             return methods.label
@@ -156,7 +176,9 @@ class Settings(Mapping[str, Any]):
         :param algorithm: the algorithm that the settings are for
         :raises ConfigError: for a name that none of them has
         """
-        names, content = Names.of(algorithm), self.as_dict()
+        content = self.as_dict()
+        policy = overrides.get("policy", self.get("policy"))
+        names = Names.of(algorithm, self.replaced(policy=policy).alias)
         for name, value in overrides.items():
             if name in names.algorithm:
                 known = content.get(name)
@@ -282,14 +304,18 @@ class Names:
     robust_value: frozenset[str]
 
     @classmethod
-    def of(cls, algorithm: type[BaseAlgorithm]) -> Names:
-        """Return the names that the settings of an algorithm may hold."""
+    def of(cls, algorithm: type[BaseAlgorithm], alias: str = SparsePolicy) -> Names:
+        """Return the names that the settings of an algorithm may hold.
+
+        :param alias: the name of the policy
+        :raises ConfigError: if the algorithm has no such policy
+        """
         from sb3_sparse.callback import SparsityCallback
         from sb3_sparse.callbacks import RobustValueCallback
 
         return cls(
             (arguments_of(algorithm) - SET_BY_THE_RUN) | ZOO_KEYS,
-            arguments_of(algorithm.policy_aliases[ALIAS]),
+            arguments_of(policy_named(algorithm, alias)),
             arguments_of(SparsityCallback) - {"method", "verbose"},
             arguments_of(RobustValueCallback) - {"verbose"},
         )

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Mapping, Set
 from dataclasses import fields
 from itertools import chain
-from typing import Any, cast
+from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -16,12 +16,11 @@ from sb3_sparse.callbacks import RobustValueCallback
 from sb3_sparse.engine.optimizers import check_weight_decay
 from sb3_sparse.errors import ConfigError, did_you_mean
 from sb3_sparse.policies.arguments import import_classes
-from sb3_sparse.policies.base import BaseSparsePolicy
 from sb3_sparse.policies.config import SPARSITY_MISSING, SparsityConfig
 from sb3_sparse.topology import Methods
 from sb3_sparse.zoo.arguments import kind_of
 from sb3_sparse.zoo.callbacks import ROBUST_VALUE
-from sb3_sparse.zoo.settings import ALIAS, CALLBACK, SET_BY_THE_RUN, Names, Settings
+from sb3_sparse.zoo.settings import CALLBACK, SET_BY_THE_RUN, Names, Settings
 
 OF_SPARSITY = frozenset(one.name for one in fields(SparsityConfig))
 
@@ -33,7 +32,7 @@ def check_settings(settings: Settings, algorithm: type[BaseAlgorithm]) -> None:
         that training would not reach
     """
     kwargs, callback = settings.policy_kwargs, settings.callback
-    names = Names.of(algorithm)
+    names = Names.of(algorithm, settings.alias)
     algo = algorithm.__name__
     _check_keys(settings, names.algorithm, f"{algo} and rl-zoo have no setting", names)
     _check_keys(kwargs, names.policy, f"policy_kwargs of {algo} have no", names)
@@ -58,7 +57,7 @@ def check_settings(settings: Settings, algorithm: type[BaseAlgorithm]) -> None:
         )
     if "sparsity" not in kwargs:
         raise ConfigError(SPARSITY_MISSING)
-    networks = cast(type[BaseSparsePolicy], algorithm.policy_aliases[ALIAS]).networks
+    networks = settings.policy_class(algorithm).networks
     config = SparsityConfig(**{n: value for n, value in kwargs.items() if n in OF_SPARSITY})
     config.check_names(networks)
     check_weight_decay(kwargs.get("weight_decay", 0.0), kwargs.get("optimizer_kwargs"))

@@ -18,8 +18,8 @@ ACTIONS = spaces.Box(-1, 1, (6,), np.float32)
 IMAGES = spaces.Box(0, 255, (4, 84, 84), np.uint8)
 
 
-def settings(**policy_kwargs):
-    return Settings({"policy_kwargs": {"sparsity": 0.0, **policy_kwargs}})
+def settings(policy="SparsePolicy", **policy_kwargs):
+    return Settings({"policy": policy, "policy_kwargs": {"sparsity": 0.0, **policy_kwargs}})
 
 
 def best_width(count, target):
@@ -44,6 +44,32 @@ def test_sac_scales_actor_and_both_critics():
     assert match.achieved == dense(width)
     assert match.policy_kwargs["net_arch"] == [width, width]
     assert match.policy_kwargs["sparsity"] == 0.0
+
+
+def simba_parameters(inputs, width, blocks, outputs):
+    """Weights and biases of the linear layers; those of norms are not counted."""
+    block = (width + 1) * 4 * width + (4 * width + 1) * width
+    return (inputs + 1) * width + blocks * block + (width + 1) * outputs
+
+
+def test_simba_keeps_one_width_in_each_network():
+    def dense(pi, qf):
+        return simba_parameters(17, pi, 1, 12) + 2 * simba_parameters(23, qf, 2, 1)
+
+    arch = {"pi": [32], "qf": [64, 64]}
+    match = match_parameters(
+        SAC, VECTOR, ACTIONS, settings("SparseSimbaPolicy", net_arch=arch), 0.8
+    )
+    (pi,), (qf, other) = match.policy_kwargs["net_arch"].values()
+    assert qf == other
+    assert match.achieved == dense(pi, qf)
+    assert abs(match.achieved - match.target) < 0.05 * match.target
+    assert abs(qf - 2 * pi) <= 1
+    layers = [(32, 17), (128, 32), (32, 128), (6, 32), (6, 32)]
+    actor = sum(active_counts(layers, 0.8)) + (32 + 128 + 32 + 12)
+    blocks = 2 * [(256, 64), (64, 256)]
+    critic = sum(active_counts([(64, 23), *blocks, (1, 64)], 0.8)) + 64 + 2 * 320 + 1
+    assert match.target == actor + 2 * critic
 
 
 def test_ppo_scales_policy_and_value_network():

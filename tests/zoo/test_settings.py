@@ -110,6 +110,45 @@ def test_a_text_without_name_or_value_is_refused(text):
         parse_overrides([text])
 
 
+@pytest.mark.parametrize(
+    ("policy", "alias"),
+    [
+        ("sb3_sparse.SparsePolicy", "SparsePolicy"),
+        ("SparsePolicy", "SparsePolicy"),
+        ("sb3_sparse.SparseSimbaPolicy", "SparseSimbaPolicy"),
+        ("SparseSimbaPolicy", "SparseSimbaPolicy"),
+    ],
+)
+def test_a_policy_goes_by_its_path_or_its_alias(policy, alias):
+    settings = Settings(base(policy=policy))
+    assert settings.alias == alias
+    assert settings.policy_class(SAC) is SAC.policy_aliases[alias]
+    assert settings.method == "rigl"
+
+
+@pytest.mark.parametrize("policy", ["MlpPolicy", "sb3_sparse.SparseMlpPolicy", None, ["a"]])
+def test_a_policy_that_is_not_sparse_is_refused(policy):
+    with pytest.raises(ConfigError, match=r"SparsePolicy or sb3_sparse\.SparseSimbaPolicy .with"):
+        Settings(base(policy=policy)).alias  # noqa: B018
+
+
+def test_another_policy_is_a_setting_like_any_other():
+    overrides = {"policy": "sb3_sparse.SparseSimbaPolicy", "net_arch": [8, 8], "n_critics": 1}
+    settings = Settings(base()).changed(overrides, SAC)
+    assert settings.alias == "SparseSimbaPolicy"
+    assert settings.policy_kwargs == {"sparsity": 0.9, "net_arch": [8, 8], "n_critics": 1}
+
+
+def test_an_algorithm_without_a_policy_names_those_that_have_it():
+    run = RunSpec(
+        algo="crossq",
+        env_id="Pendulum-v1",
+        hyperparams={"policy": "sb3_sparse.SparseSimbaPolicy"},
+    )
+    with pytest.raises(ConfigError, match="CrossQ has no SparseSimbaPolicy; it is there for DQN"):
+        run.settings()
+
+
 def test_the_method_is_read_off_the_callback_or_the_sparsity():
     assert Settings(base()).method == "rigl"
     assert Settings(base(callback=None)).method == "static"
