@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from sb3_sparse.report.measured import Rows
 from sb3_sparse.report.methods import DENSE, EQUAL
+from sb3_sparse.zoo.clock import seconds_in
 from sb3_sparse.zoo.environments import suite_of
 from sb3_sparse.zoo.record import Record, Status
 from sb3_sparse.zoo.results import score_of
@@ -20,7 +21,7 @@ from sb3_sparse.zoo.settings import Settings
 
 Array = npt.NDArray[np.float64]
 WIDTHS = ("net_arch", "features_extractor_class", "features_extractor_kwargs")
-"""Settings that match_params changes, so they do not distinguish variants."""
+"""Settings that match_params changes; those that were asked for distinguish variants."""
 
 
 @dataclass(frozen=True)
@@ -151,6 +152,17 @@ class RunData:
         return int(self.record["total"]["dense_flops"])
 
     @property
+    def seconds(self) -> float | None:
+        """The seconds that it trained, without evaluations; None if its record lacks them.
+
+        Those of the processor, which other processes do not change, or on a GPU those that passed.
+        """
+        found = seconds_in(self.record)
+        if found is None:
+            return None
+        return found.processor if self.record.get("device", "cpu") == "cpu" else found.wall
+
+    @property
     def layers(self) -> list[dict[str, Any]]:
         return list(self.record["layers"])
 
@@ -163,12 +175,25 @@ class RunData:
         total = sum(counts.values())
         return counts["actor"] / total if len(counts) > 1 and counts.get("actor") else None
 
+    @cached_property
+    def asked(self) -> Settings:
+        """Its settings, with the widths that were asked for in place of those of a match.
+
+        Widths that the config gave are left out there.
+        """
+        if self.label != EQUAL:
+            return self.settings
+        changed = self.record["run"].get("hyperparams") or {}
+        kwargs = {n: value for n, value in self.settings.policy_kwargs.items() if n not in WIDTHS}
+        kwargs.update({name: changed[name] for name in WIDTHS if name in changed})
+        return self.settings.replaced(policy_kwargs=kwargs)
+
     def variant(self, *without: str) -> str:
         """Return its settings without method and sparsity, as a text to compare.
 
         :param without: names of more settings that may differ
         """
-        return self.settings.variant((*without, *(WIDTHS if self.label == EQUAL else ())))
+        return self.asked.variant(without)
 
     @property
     def changes(self) -> int:

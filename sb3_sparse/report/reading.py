@@ -112,6 +112,7 @@ def _try_out(run: RunData) -> None:
     """Read everything that a report reads, so that a wrong type shows here."""
     numbers = [run.seed, run.steps, run.level, run.parameters, run.connections, run.flops]
     numbers += [run.dense_flops, run.actor_share or 0.0, run.score if run.trained else 0.0]
+    numbers += [run.seconds or 0.0]
     if not all(map(math.isfinite, numbers)):
         raise CorruptStateError(f"{run.folder / NAME} is damaged: a number in it is not finite")
     for layer in run.layers:

@@ -16,6 +16,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_sparse.files import sync
+from sb3_sparse.zoo.clock import Clock
 from sb3_sparse.zoo.divergence import check_networks
 from sb3_sparse.zoo.evaluation import Evaluation
 from sb3_sparse.zoo.folder import MONITOR, REPLAY_BUFFER, VECNORMALIZE, RunFolder, env_name
@@ -38,13 +39,17 @@ class Checkpoints(BaseCallback):
     :param folder: the run's folder
     :param env_id: environment that the model trains in
     :param evaluation: callback whose evaluations the checkpoint includes
+    :param clock: paused during each save
     """
 
-    def __init__(self, folder: RunFolder, env_id: str, evaluation: Evaluation) -> None:
+    def __init__(
+        self, folder: RunFolder, env_id: str, evaluation: Evaluation, clock: Clock
+    ) -> None:
         super().__init__()
         self.folder = folder
         self.env_name = env_name(env_id)
         self.evaluation = evaluation
+        self.clock = clock
         self.stop_wanted = False
         self.buffer: BufferSaver | None = None
 
@@ -58,7 +63,8 @@ class Checkpoints(BaseCallback):
         evaluated = self.evaluation.count > self.saved_evaluations
         late = time.monotonic() > self.saved_at + SECONDS
         if evaluated or late or self.stop_wanted:
-            self.save()
+            with self.clock.paused():
+                self.save()
             self.saved_evaluations, self.saved_at = self.evaluation.count, time.monotonic()
         if self.stop_wanted:
             raise StopTraining
@@ -85,7 +91,7 @@ class Checkpoints(BaseCallback):
             raise
         new.rename(final)
         sync(parent)
-        self.folder.write(num_timesteps=self.model.num_timesteps)
+        self.folder.write(num_timesteps=self.model.num_timesteps, **self.clock.entry())
         for other in parent.iterdir():
             if other != final:
                 shutil.rmtree(other)

@@ -22,6 +22,7 @@ from sb3_sparse.loading.text import read_json
 from sb3_sparse.loading.zips import read_model
 from sb3_sparse.policies.base import BaseSparsePolicy
 from sb3_sparse.policies.compiled import unwrapped
+from sb3_sparse.zoo.clock import Clock
 from sb3_sparse.zoo.divergence import check_networks, check_return
 from sb3_sparse.zoo.folder import BEST, EVALUATIONS
 from sb3_sparse.zoo.watch import Watch
@@ -96,6 +97,7 @@ class Evaluation(EvalCallback):
     :param deterministic: whether the policy acts deterministically
     :param on_new_best: called after each new best model
     :param watch: notified of each evaluation
+    :param clock: paused during each evaluation
     :param after_each: called after each evaluation
     """
 
@@ -108,6 +110,7 @@ class Evaluation(EvalCallback):
         deterministic: bool,
         on_new_best: BaseCallback,
         watch: Watch,
+        clock: Clock,
         after_each: BaseCallback | None = None,
     ) -> None:
         super().__init__(
@@ -124,6 +127,7 @@ class Evaluation(EvalCallback):
         self.folder = folder
         self.every = every
         self.watch = watch
+        self.clock = clock
 
     @property
     def count(self) -> int:
@@ -172,6 +176,10 @@ class Evaluation(EvalCallback):
         if self.num_timesteps < self.next:
             return True
         self.next = (self.num_timesteps // self.every + 1) * self.every
+        with self.clock.paused():
+            return self._evaluate_and_tell()
+
+    def _evaluate_and_tell(self) -> bool:
         check_networks(self.model)
         with self._whole_files():
             go_on = self._evaluate()

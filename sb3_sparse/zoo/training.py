@@ -16,6 +16,7 @@ from sb3_sparse.errors import ConfigError, CorruptStateError, command
 from sb3_sparse.policies.base import BaseSparsePolicy
 from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.zoo.checkpoint import Checkpoints, StopTraining, restored_monitors
+from sb3_sparse.zoo.clock import Clock, Seconds, seconds_in
 from sb3_sparse.zoo.computing import (
     computing_at,
     counts_of,
@@ -180,6 +181,8 @@ class _Session:
         self.callbacks = callbacks
         self.after_evaluation = after_evaluation
         self.stop_wanted = False
+        anew = manager.start.folder is None
+        self.clock = Clock(Seconds() if anew else seconds_in(self.folder.record()))
         policy = unwrapped(model.policy)
         assert isinstance(policy, BaseSparsePolicy)
         self.policy = policy
@@ -200,6 +203,7 @@ class _Session:
                     self.manager.deterministic_eval,
                     self.manager.keep_normalization(),
                     self.watch,
+                    self.clock,
                     self.after_evaluation,
                 )
                 status = self._train(evaluation)
@@ -208,6 +212,7 @@ class _Session:
                     status=status,
                     trained=status is Status.EVALUATING,
                     num_timesteps=self.model.num_timesteps,
+                    **self.clock.entry(),
                     **counts_of(self.policy),
                 )
                 if self.stop_wanted:
@@ -248,10 +253,15 @@ class _Session:
         )
         if left <= 0:
             return Status.EVALUATING
-        checkpoints = Checkpoints(self.folder, self.run.env_id, evaluation)
+        checkpoints = Checkpoints(self.folder, self.run.env_id, evaluation, self.clock)
         during = [*self.manager.callbacks, evaluation, checkpoints, *self.callbacks, self.watch]
         try:
-            with checkpoints.on_signals(), denormals_as_zero(), diverging(model):
+            with (
+                checkpoints.on_signals(),
+                denormals_as_zero(),
+                diverging(model),
+                self.clock.running(),
+            ):
                 model.learn(
                     left,
                     callback=during,

@@ -43,6 +43,7 @@ class Folders:
         size: float = 1.0,
         snr: dict[str, float] | None = None,
         noise: dict[float, float] | None = None,
+        seconds: float | None = None,
     ) -> Path:
         """One run. Its last evaluation is the score."""
         folder = self.root / f"{len(self.made):04d}" / algo / f"{env_id.replace('/', '-')}_1"
@@ -85,6 +86,8 @@ class Folders:
             "layers": layers,
             "versions": {"python": "3.11", "torch": "2.13.0"},
         }  # fmt: skip
+        if seconds is not None:
+            record["seconds"] = {"wall": 2 * seconds, "processor": seconds}
         (folder / "sparsity.json").write_text(json.dumps(record))
         if status == "finished":
             means = score if isinstance(score, list) else [score] * evaluations
@@ -178,5 +181,14 @@ def study_folders(tmp_path_factory):
                 share=share, policy=asked, overrides=asked,
             )  # fmt: skip
         made.add("dense", None, seed, 1000.0, env_id="Hopper-v5", algo="sac", share=0.34)
+        for width in (256, 512):
+            for label, match in (("dense", None), ("dense", 0.9), ("rigl", None)):
+                made.add(
+                    label, None if label == "dense" else 0.9, seed, width + 10.0 * seed,
+                    env_id="HalfCheetah-v5", algo="sac", match=match, size=width / 512,
+                    seconds=width * (1.0 if label == "dense" else 0.5),
+                    overrides={"net_arch": [width]},
+                    policy={} if match else {"net_arch": [width]},
+                )  # fmt: skip
     made.add("rigl", 0.9, 0, env_id="ALE/Pong-v5", status="counted")
     return made.made

@@ -33,10 +33,45 @@ def test_a_smaller_dense_network_has_a_label_of_its_own(folders):
     assert [(run.label, run.level) for run in runs] == [("dense", 0.0), ("dense-equal", 0.9)]
 
 
+def test_dense_networks_that_match_those_of_other_widths_are_other_variants(folders):
+    for width in (256, 512):
+        for seed in range(2):
+            built = {"net_arch": [width // 10]}
+            asked = {"net_arch": [width]}
+            folders.add("dense", None, seed, match=0.9, policy=built, overrides=asked)
+    runs, _ = read_runs(folders.made)
+    assert len(runs) == 4
+    assert len({run.variant() for run in runs}) == 2
+    assert len({run.variant("net_arch") for run in runs}) == 1
+    assert {run.asked.value("net_arch")[0] for run in runs} == {256, 512}
+
+
+def test_simba_networks_are_compared_with_each_other(folders):
+    folders.add(settings={"policy": "sb3_sparse.SparseSimbaPolicy"})
+    folders.add(settings={"policy": "sb3_sparse.SparsePolicy"})
+    runs, _ = read_runs(folders.made)
+    families = [run.family for run in runs]
+    assert families == ["DQN with SimBa networks on classic control", "DQN on classic control"]
+
+
+def test_seconds_are_the_processors_or_on_a_gpu_those_that_passed(folders):
+    on_cpu, on_gpu, old = folders.add(seed=0, seconds=5.0), folders.add(seed=1), folders.add(seed=2)
+    changed(on_gpu, "seconds", wall=7.0, processor=9.0)
+    path = on_gpu / "sparsity.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "device": "cuda"}))
+    runs, _ = read_runs([on_cpu, on_gpu, old])
+    assert [run.seconds for run in runs] == [5.0, 7.0, None]
+
+
+def test_a_damaged_number_of_seconds_is_named(folders):
+    folder = folders.add(seconds=-1.0)
+    assert "damaged" in reasons([folder])[1][folder]
+
+
 def changed(folder, part, **values):
     path = folder / "sparsity.json"
     record = json.loads(path.read_text())
-    record[part] = {**record[part], **values}
+    record[part] = {**record.get(part, {}), **values}
     path.write_text(json.dumps(record))
 
 

@@ -75,6 +75,28 @@ def test_the_numbers_behind_figures_are_right(report):
     }
     assert {"1e-06", "0.001"} <= set(found)
     assert (found["1e-06"], found["0.001"]) == (410.0, 400.0)
+    rows = list(csv.DictReader((report.parent / "figures" / "seconds.csv").open()))
+    found = {
+        (row["method"], row["net_arch"]): (float(row["seconds of training"]), row["mean score"])
+        for row in rows
+    }
+    assert found == {
+        ("dense", "[256]"): (256.0, "266"),
+        ("dense", "[512]"): (512.0, "522"),
+        ("dense-equal", "[256]"): (256.0, "266"),
+        ("dense-equal", "[512]"): (512.0, "522"),
+        ("rigl", "[256]"): (128.0, "266"),
+        ("rigl", "[512]"): (256.0, "522"),
+    }
+    rows = list(csv.DictReader((report.parent / "figures" / "scaling.csv").open()))
+    sizes = {
+        (row["method"], row["net_arch"]): int(row["parameters"])
+        for row in rows
+        if row["environment"] == "HalfCheetah-v5"
+    }
+    full, half = 64 * 64 + 10, 32 * 64 + 10
+    assert (sizes["dense", "[512]"], sizes["dense", "[256]"]) == (full, half)
+    assert sizes["rigl", "[512]"] == sizes["dense-equal", "[512]"] == round(409.6) + 10
     rows = list(csv.DictReader((report.parent / "figures" / "snr.csv").open()))
     assert {row["network"] for row in rows} == {"q_net"}
 

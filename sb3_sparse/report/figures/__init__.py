@@ -10,6 +10,7 @@ from sb3_sparse.report.figures import (  # noqa: F401
     parameters,
     profiles,
     ratio,
+    seconds,
     sensitivity,
     snr,
 )
