@@ -42,6 +42,8 @@ EDGES = {
     "typer": {"cli"},
     "rich": {"cli"},
     "rl_zoo3": {"zoo", "rl_zoo_optimize"},
+    "shimmy": {"zoo"},
+    "dm_control": {"zoo"},
     "optuna": {"tuning"},
     "matplotlib": {"report"},
     "rliable": {"report"},

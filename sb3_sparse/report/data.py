@@ -103,7 +103,7 @@ class RunData:
         """Algorithm, architecture and suite; runs of one family are compared."""
         extractor = str(self.settings.policy_kwargs.get("features_extractor_class", ""))
         resnet = " with the Impala ResNet" if "impala" in extractor.lower() else ""
-        simba = " with SimBa networks" if "Simba" in str(self.settings.get("policy")) else ""
+        simba = " with SimBa" if "Simba" in str(self.settings.get("policy")) else ""
         return f"{self.algo.upper()}{resnet}{simba} on {suite_of(self.env_id)}"
 
     @cached_property

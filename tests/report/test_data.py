@@ -51,7 +51,7 @@ def test_simba_networks_are_compared_with_each_other(folders):
     folders.add(settings={"policy": "sb3_sparse.SparsePolicy"})
     runs, _ = read_runs(folders.made)
     families = [run.family for run in runs]
-    assert families == ["DQN with SimBa networks on classic control", "DQN on classic control"]
+    assert families == ["DQN with SimBa on classic control", "DQN on classic control"]
 
 
 def test_seconds_are_the_processors_or_on_a_gpu_those_that_passed(folders):
