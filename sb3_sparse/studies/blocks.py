@@ -88,8 +88,8 @@ def check_keys(given: Any, allowed: set[str], where: str) -> None:
 def block_of(common: Any, block: Any, scale: Mapping[str, Any]) -> dict[str, Any]:
     """Apply a scale to a block of runs.
 
-    ``hyperparams`` are merged. A scale's sparsities, methods and varied hyperparameters apply only
-    to blocks that set them; its other keys apply to every block.
+    ``hyperparams`` are merged. A scale's sparsities, methods and varied hyperparameters select from
+    those of blocks that set them; its other keys apply to every block.
     """
     for given, where in ((common, "common"), (block, "a block of runs")):
         check_keys(given, RUN_KEYS | {VARY}, where)
@@ -107,8 +107,10 @@ def block_of(common: Any, block: Any, scale: Mapping[str, Any]) -> dict[str, Any
     }
     for key, value in scale.items():
         if key == VARY:
-            known = made.get(VARY, {})
-            made[VARY] = {**known, **{name: value[name] for name in known if name in value}}
+            made[VARY] = {
+                name: _kept(values, value[name]) if name in value else values
+                for name, values in made.get(VARY, {}).items()
+            }
         elif key in CHOSEN:
             made[key] = _kept(made[key], value) if key in made else None
         elif key != "hyperparams":

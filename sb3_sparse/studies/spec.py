@@ -190,12 +190,12 @@ def _check_choices(blocks: Sequence[Mapping[str, Any]], scale: Mapping[str, Any]
         known = [value for values in given if values is not None for value in as_list(values)]
         if not known:
             raise ConfigError(f"the scale chooses {key}, which no block has; put it into a block")
-        for value in [] if key.startswith(VARY) else as_list(wanted):
+        for value in as_list(wanted):
             if value not in known:
                 allowed = ", ".join(dict.fromkeys(map(repr, known)))
                 raise ConfigError(
                     f"the scale chooses {key}: {value!r}, which no block has"
-                    f"{did_you_mean(value, map(str, known))}; their values are {allowed}"
+                    f"{did_you_mean(str(value), map(str, known))}; their values are {allowed}"
                 )
 
 

@@ -168,6 +168,46 @@ def test_a_scale_chooses_among_single_values_as_among_lists(tmp_path):
         assert {cell.run.method for cell in cells} == {"set"}
 
 
+def test_a_scale_chooses_among_varied_values(tmp_path):
+    runs = [
+        {"method": "dense", "vary": {"net_arch": [[4, 4], [8, 8]], "gamma": [0.9, 0.99]}},
+        {"method": "rigl", "sparsity": 0.9, "vary": {"net_arch": [[5, 5], [6, 6]]}},
+        {"method": "set", "sparsity": 0.9, "vary": {"net_arch": [[7, 7]]}},
+        {"method": "static", "sparsity": 0.9},
+    ]
+    scales = {"smoke": {"env_id": "CartPole-v1", "vary": {"net_arch": [[8, 8], [5, 5]]}}}
+    runs = [cell.run for cell in read(tmp_path, runs=runs, scales=scales).cells]
+    assert [(run.method, dict(run.hyperparams)) for run in runs] == [
+        ("dense", {"net_arch": [8, 8], "gamma": 0.9}),
+        ("dense", {"net_arch": [8, 8], "gamma": 0.99}),
+        ("rigl", {"net_arch": [5, 5]}),
+        ("static", {}),
+    ]
+    one = [{"method": "dense", "vary": {"net_arch": [[8, 8]]}}]
+    none = {"smoke": {"vary": {"net_arch": [[8, 9]]}}}
+    with pytest.raises(ConfigError, match=r"chooses vary: net_arch: \[8, 9\], which no block has"):
+        read(tmp_path, runs=one, scales=none)
+
+
+def test_the_study_of_scaling_compares_plain_and_simba_networks_at_equal_parameters():
+    for scale in ("smoke", "small", "medium", "paper"):
+        cells = Study.read("scaling", scale).cells
+        for simba in (False, True):
+            runs = [one.run for one in cells if ("policy" in one.run.hyperparams) == simba]
+            widths = {str(run.hyperparams["net_arch"]) for run in runs}
+            found = {(run.method, run.sparsity, run.match_params) for run in runs}
+            sparse = {sparsity for _, sparsity, _ in found} - {None}
+            matched = {match for *_, match in found} - {None}
+            assert matched
+            assert matched <= sparse
+            assert {method for method, sparsity, _ in found if sparsity} >= {"static"}
+            seeds = {run.seed for run in runs}
+            tasks = {run.env_id for run in runs}
+            assert len(runs) == len(widths) * len(found) * len(seeds) * len(tasks)
+            alias = "SparseSimbaPolicy" if simba else "SparsePolicy"
+            assert {run.settings().alias for run in runs[:20]} == {alias}
+
+
 def test_an_unknown_study_is_answered_with_the_nearest_and_all_names():
     with pytest.raises(ConfigError, match=r"'clasic_control' \(did you mean 'classic_control'\?\)"):
         Study.read("clasic_control", "small")
@@ -181,7 +221,7 @@ def test_every_study_of_the_issue_is_shipped():
         *("parameters_sac", "parameters_ppo", "parameters_dqn"),
         *("actor_critic", "distribution", "weight_decay", "initialisation", "drop_fraction"),
         *("update_interval", "batch_size", "last_layer_dense", "snr", "noise", "flops"),
-        "robust_value",
+        *("robust_value", "scaling"),
     }
 
 
@@ -228,7 +268,7 @@ def test_medium_has_all_ways_at_two_sparsities_and_seeds_enough(name, seeds, ste
 
 def test_some_studies_have_a_scale_medium():
     names = [name for name in study_names() if "medium" in planned_runs(name)]
-    assert names == ["classic_control", "ppo", "robust_value", "sac"]
+    assert names == ["classic_control", "ppo", "robust_value", "sac", "scaling"]
     assert set(SCALES) == {scale for name in study_names() for scale in planned_runs(name)}
 
 

@@ -9,7 +9,7 @@ import pytest
 from stable_baselines3 import DQN, PPO, SAC
 
 from sb3_sparse.errors import ConfigError
-from sb3_sparse.zoo.settings import CALLBACK, POLICY, Settings, parse_overrides
+from sb3_sparse.zoo.settings import CALLBACK, Settings, parse_overrides
 from sb3_sparse.zoo.spec import RunSpec
 from sb3_sparse.zoo.validation import check_settings
 
@@ -318,7 +318,7 @@ def test_a_setting_is_found_wherever_it_lies():
 
 ROBUST = "sb3_sparse.RobustValueCallback"
 RLX2 = {
-    "policy": POLICY,
+    "policy": "sb3_sparse.SparsePolicy",
     "policy_kwargs": {"sparsity": 0.9},
     "callback": [{CALLBACK: {"method": "rigl"}}, {ROBUST: {"multi_step": 3}}],
 }
