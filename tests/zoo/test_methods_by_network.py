@@ -92,7 +92,8 @@ def test_half_the_sparsity_follows_the_sparsity_and_another_start_stays():
     own = pendulum(method="granet", sparsity=0.8, hyperparams={"initial_sparsity": 0.2})
     assert own.settings().policy_kwargs["initial_sparsity"] == 0.2
     kwargs = {"sparsity": 0.9, "initial_sparsity": 0.2}
-    content = {"policy_kwargs": kwargs, "callback": {CALLBACK: {"method": "granet"}}}
+    content = {"policy": "SparsePolicy", "policy_kwargs": kwargs}
+    content["callback"] = {CALLBACK: {"method": "granet"}}
     kept = Settings(content).changed({"sparsity": 0.5}, SAC)
     assert kept.policy_kwargs["initial_sparsity"] == 0.2
     by_network = {"sparsity": {"actor": 0.9, "critic": 0.6}}
