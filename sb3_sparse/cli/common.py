@@ -50,7 +50,7 @@ GymPackages = Annotated[
 Method = Annotated[
     str | None,
     option(
-        "dense, prune, static, set, rigl, granet, actor=static,critic=rigl, or a preset (mst).",
+        "dense, prune, static, set, rigl, granet, actor=static,critic=rigl, or a preset (simba).",
         shown="rigl",
     ),
 ]

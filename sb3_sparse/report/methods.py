@@ -16,6 +16,7 @@ NAMES = {
     "granet": "GraNet",
     "mst": "MST",
     "rlx2": "RLx2",
+    "simba": "SimBa, static",
 }
 
 

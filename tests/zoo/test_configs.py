@@ -177,6 +177,68 @@ def test_every_key_is_known_to_the_algorithm_the_policy_or_the_zoo(path):
             assert Settings(settings).method == path.parent.name
 
 
+SIMBA = ("sac", "td3", "ddpg", "tqc", "dqn", "qrdqn", "ppo", "a2c")
+OBSERVATIONS_ONLY = {"norm_obs": True, "norm_reward": False}
+
+
+@pytest.mark.parametrize("algo", SIMBA)
+def test_simba_networks_have_normalised_observations_and_adamw(algo):
+    for key in yaml.safe_load(config_path("simba", algo).read_text()):
+        if key == "default":
+            continue
+        settings = RunSpec(algo, key, method="simba").settings()
+        assert settings.alias == "SparseSimbaPolicy"
+        assert settings.method == "static"
+        assert settings.policy_kwargs["sparsity"] == 0.8
+        assert settings.policy_kwargs["optimizer_class"] == "torch.optim.AdamW"
+        assert OBSERVATIONS_ONLY.items() <= settings["normalize"].items()
+
+
+def test_simba_on_mujoco_is_as_in_sbx():
+    settings = RunSpec("sac", "HalfCheetah-v5", method="simba").settings()
+    assert_has(settings, {"learning_rate": 3e-4, "learning_starts": 10_000, "batch_size": 256})
+    assert settings["normalize"] == OBSERVATIONS_ONLY
+    kwargs = settings.policy_kwargs
+    assert (kwargs["net_arch"], kwargs["n_critics"]) == ({"pi": [128], "qf": [256, 256]}, 2)
+    assert kwargs["optimizer_kwargs"] == {"weight_decay": 1e-4}  # optax's
+
+
+@pytest.mark.parametrize(
+    ("task", "actions"), [("dog-stand", 38), ("dog-walk", 38), ("humanoid-stand", 21)]
+)
+def test_simba_on_the_control_suite_is_as_in_2506_17204(task, actions):
+    pytest.importorskip("dm_control")
+    run = RunSpec("sac", f"dm_control/{task}-v0", method="simba")
+    settings = run.settings()
+    assert_has(
+        settings,
+        {
+            "n_timesteps": 1_000_000 // 2,
+            "learning_rate": 1e-4,
+            "buffer_size": 1_000_000,
+            "learning_starts": 5000,
+            "batch_size": 256,
+            "gamma": 0.99,
+            "tau": 0.005,
+            "train_freq": 1,
+            "gradient_steps": 2,
+            "ent_coef": "auto_0.01",
+            "target_entropy": -actions / 2,
+            "normalize": {**OBSERVATIONS_ONLY, "clip_obs": float("inf")},
+        },
+    )
+    assert settings["env_wrapper"][0] == {"sb3_sparse.wrappers.ActionRepeat": {"repeat": 2}}
+    assert settings.policy_kwargs == {
+        "net_arch": {"pi": [128], "qf": [512, 512]},
+        "n_critics": 1,
+        "optimizer_class": "torch.optim.AdamW",
+        "optimizer_kwargs": {"weight_decay": 0.01},
+        "sparsity": 0.8,
+        "sparsity_aware_init": False,
+    }
+    assert run.evaluation() == {"eval_freq": 5000, "eval_episodes": 10}
+
+
 def test_every_method_of_the_paper_has_every_algorithm():
     names = {*algorithms(), "dqn_impala"}
     of_paper = {(p.parent.name, p.stem) for p in SHIPPED if p.parent.name in METHODS}
