@@ -98,13 +98,17 @@ class DynamicReplayBuffer(NStepReplayBuffer):
         super().reset()
         self.forgotten = self.without_means = 0
 
+    @property
+    def _first(self) -> int:
+        """The oldest row in use, counted on past the end of the ring."""
+        return (self.pos if self.full else 0) + self.forgotten
+
     def oldest(self, count: int) -> Rows:
         """Return the numbers of the oldest rows in use, from the oldest.
 
         :param count: how many, at most :meth:`size`
         """
-        first = (self.pos if self.full else 0) + self.forgotten
-        return (first + np.arange(count)) % self.buffer_size
+        return (self._first + np.arange(count)) % self.buffer_size
 
     def newest(self, count: int) -> Rows:
         """Return the numbers of the newest rows in use, up to the newest.
@@ -155,7 +159,7 @@ class DynamicReplayBuffer(NStepReplayBuffer):
         if not self.forgotten:
             return super().sample(batch_size, env)
         drawn = np.random.randint(0, self.size(), size=batch_size)
-        return self._get_samples(self.oldest(self.size())[drawn], env)
+        return self._get_samples((self._first + drawn) % self.buffer_size, env)
 
     def _get_samples(
         self, batch_inds: Rows, env: VecNormalize | None = None

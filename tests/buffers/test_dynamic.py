@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import pickle
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -87,6 +88,22 @@ def test_every_row_in_use_is_drawn_and_no_other():
     assert buffer.forgotten == 0
     add(buffer, 14)
     assert numbers(buffer) == [*range(7, 15)]
+
+
+def test_a_sample_costs_nothing_that_grows_with_the_buffer():
+    buffer = make(200_000)
+    buffer.observations[:, 0, 0] = np.arange(200_000)
+    buffer.pos, buffer.full = 3, True
+    buffer.shrink(9)
+    np.random.seed(0)
+    expected = (12 + np.random.randint(0, 199_991, size=16)) % 200_000
+    np.random.seed(0)
+    tracemalloc.start()
+    batch = buffer.sample(16)
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert most < 100_000  # bytes; an index of each row would take 1,600,000
+    assert batch.observations[:, 0].tolist() == expected.tolist()
 
 
 def test_returns_over_three_steps_by_hand():
