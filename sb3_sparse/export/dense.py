@@ -11,6 +11,7 @@ from typing import Any
 import stable_baselines3
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.save_util import is_json_serializable
 
@@ -47,6 +48,8 @@ def write_dense(model: BaseAlgorithm) -> bytes:
     policy = unwrapped(model.policy)
     data["policy_class"] = _stock_class(type(policy))
     data["policy_kwargs"] = _stock_kwargs(policy, data["policy_kwargs"])
+    if getattr(data.get("replay_buffer_class"), "__module__", "").startswith("sb3_sparse."):
+        data |= _stock_buffer(data["replay_buffer_kwargs"])
     for name in FORGOTTEN:
         if name in data:
             data[name] = None
@@ -87,6 +90,17 @@ def _stock_kwargs(policy: BasePolicy, kwargs: dict[str, Any]) -> dict[str, Any]:
     if isinstance(policy, BaseSparsePolicy):  # whose default may differ
         stock["features_extractor_class"] = policy.features_extractor_class
     return stock
+
+
+def _stock_buffer(kwargs: dict[str, Any]) -> dict[str, Any]:
+    """Return the attributes that name SB3's replay buffer in place of one of this package.
+
+    :param kwargs: arguments of the latter
+    """
+    if kwargs.keys() & {"n_steps", "gamma"}:  # returns over several steps that the user chose
+        buffer, kwargs = NStepReplayBuffer, {"n_steps": 1, **kwargs}
+        return {"replay_buffer_class": buffer, "replay_buffer_kwargs": kwargs}
+    return {"replay_buffer_class": None}  # SB3 chooses
 
 
 def _zipped(data: dict[str, Any], params: Any, variables: Any) -> bytes:

@@ -9,13 +9,15 @@ import torch as th
 from export.tools import VECTOR, OddExtractor, OwnExtractor, Task
 from gymnasium import spaces
 from sb3_contrib import RecurrentPPO
-from stable_baselines3 import PPO
+from stable_baselines3 import PPO, SAC
+from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 from support import make
 from torch import nn
 
-from sb3_sparse import SparseActorCriticPolicy
+from sb3_sparse import RobustValueCallback, SparseActorCriticPolicy, SparsityCallback
+from sb3_sparse.buffers import DynamicReplayBuffer
 from sb3_sparse.errors import (
     ConfigError,
     Diverged,
@@ -132,6 +134,25 @@ def test_a_dense_zip_that_stock_sb3_cannot_load_is_not_written(tmp_path):
         export_policy(model, tmp_path / "policy", "dense", force=True)
     assert written(tmp_path) == []
     assert export_policy(model, tmp_path / "policy", "c").parity.holds
+
+
+@pytest.mark.parametrize("compute", ["masked", "sparse"])
+def test_a_model_that_rlx2_trained_is_a_dense_zip_with_sb3s_buffer(compute, tmp_path):
+    model = make("SAC", policy_kwargs=dict(compute=compute))
+    rlx2 = [SparsityCallback("rigl", update_interval=5), RobustValueCallback(check_interval=10)]
+    model.learn(40, rlx2)
+    assert export_policy(model, tmp_path / "policy", "dense").parity.holds
+    stock = type(model).load(tmp_path / "policy.zip", env=model.get_env())
+    assert type(stock.replay_buffer) is ReplayBuffer
+    stock.learn(40)
+
+
+def test_a_dense_zip_keeps_the_steps_of_returns(tmp_path):
+    arguments = dict(replay_buffer_class=DynamicReplayBuffer, replay_buffer_kwargs={"n_steps": 4})
+    export_policy(make("SAC", **arguments), tmp_path / "policy", "dense")
+    buffer = SAC.load(tmp_path / "policy.zip").replay_buffer
+    assert type(buffer) is NStepReplayBuffer
+    assert buffer.n_steps == 4
 
 
 def test_other_algorithms_are_refused(tmp_path):
