@@ -54,7 +54,7 @@ class SparsityCallback(BaseCallback):
     :param verbose: as in SB3
     :raises ConfigError: for an unknown method, a value that is not allowed or an argument that
         means nothing for the method; when training begins, for a network that the policy lacks, or
-        one that its method would not bring to its sparsity
+        one whose method would not bring it from its initial sparsity to its final one
 
     Source: arXiv:2206.10369, sections 2.1 and A.3; a method for each network, arXiv:2510.12096.
     """
@@ -182,21 +182,22 @@ class SparsityCallback(BaseCallback):
 def _check_starts_denser(
     policy: BaseSparsePolicy, method: TopologyMethod, networks: list[SparseNetwork]
 ) -> None:
-    """Require something to prune of a method that prunes.
+    """Require something to prune of a method that prunes, in each network that ends sparse.
 
     :param networks: those that the method prunes
     """
-    layers = [layer for network in networks for layer in network.layers]
-    if any(layer.initial_nnz != layer.final_nnz for layer in layers):
-        return
     final = policy.sparsity_config.by_network({n.name: n.size for n in policy.sparse.networks})
+    idle = [n for n in networks if all(x.initial_nnz == x.final_nnz for x in n.layers)]
+    if len(idle) < len(networks) and all(final[n.name] == 0 for n in idle):
+        return
     starts = {n.name: method.initial_sparsity(final[n.name]) for n in networks}
     alike = len(networks) == len(final) and len(set(starts.values())) == 1
     start = next(iter(starts.values())) if alike else starts
     share = f" ({method.initial_share:.0%} of the sparsity)" if method.initial_share else ""
     raise ConfigError(
-        f"method {method.name!r} needs a policy that starts denser than it ends: give a sparsity "
-        f"above 0 and initial_sparsity={start} in policy_kwargs{share}"
+        f"method {method.name!r} needs a policy that starts denser than it ends, and "
+        f"{', '.join(n.name for n in idle)} would not: give a sparsity above 0 and "
+        f"initial_sparsity={start} in policy_kwargs{share}"
     )
 
 

@@ -139,6 +139,22 @@ def test_a_network_that_is_pruned_must_start_denser_and_the_message_says_how(
         learn(SparsityCallback(method), sparsity=sparsity)
 
 
+def test_each_network_that_is_pruned_must_start_denser():
+    with pytest.raises(ConfigError, match="'prune' needs .* and actor would not: give"):
+        learn(SparsityCallback("prune"), initial_sparsity={"critic": 0.0})
+    with pytest.raises(ConfigError, match="'granet' needs .* and critic would not: give"):
+        learn(
+            SparsityCallback({"actor": "prune", "critic": "granet"}),
+            initial_sparsity={"actor": 0.0},
+        )
+
+
+def test_a_network_that_stays_dense_needs_no_denser_start():
+    callback = SparsityCallback("prune", update_interval=5)
+    model = learn(callback, sparsity={"actor": 0.0, "critic": 0.9}, initial_sparsity=0.0)
+    assert model.policy.sparsity_report().sparsity("critic") == pytest.approx(0.9, abs=0.01)
+
+
 def test_a_network_that_starts_denser_must_be_pruned():
     with pytest.raises(ConfigError, match="'static' of actor would never.*'granet' or 'prune'"):
         learn(SparsityCallback({"critic": "prune"}), initial_sparsity=0.0)

@@ -123,12 +123,15 @@ def _check_start(
             f"would keep {', '.join(sorted(denser - prunes))} that dense; leave initial_sparsity "
             f"out there, or prune with callback: [{{{CALLBACK}: {{method: prune}}}}]"
         )
-    if prunes and not denser:
+    idle = {network for network in prunes - denser if ends[network] != 0.0}
+    if idle or (prunes and not denser):
         assert methods is not None
         usual = methods.initial_sparsity(final)
+        where = f" for {', '.join(sorted(idle))}" if idle and denser else ""
         raise ConfigError(
             f"method {methods.label!r} begins denser than it ends, but initial_sparsity is "
-            f"{initial} and sparsity {final}; give initial_sparsity: {usual} and a sparsity above 0"
+            f"{initial} and sparsity {final}{where}; give initial_sparsity: {usual} and a sparsity "
+            "above 0"
         )
 
 
