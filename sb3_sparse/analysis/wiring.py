@@ -57,7 +57,7 @@ def wiring_of(policy: BasePolicy, observations: Any) -> dict[str, Wiring]:
             if id(module) not in seen:
                 seen.add(id(module))
                 trial.watch(name, module)
-    # Of critics' inputs, an actor's outputs are not units.
+    # Actions among a critic's inputs are not units, so they are zeros here.
     actions = th.zeros((1, get_action_dim(twin.action_space)), device=twin.device)
     with th.no_grad():
         for network in specs_of(twin):

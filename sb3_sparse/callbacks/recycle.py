@@ -11,11 +11,12 @@ from torch import nn
 from sb3_sparse.analysis.activity import activity
 from sb3_sparse.analysis.batches import sample_batch
 from sb3_sparse.analysis.wiring import Wiring, wiring_of
-from sb3_sparse.callbacks.initial import initial_parameters, sparse_policy_of
+from sb3_sparse.callbacks.initial import initial_state, sparse_policy_of
 from sb3_sparse.callbacks.interval import IntervalCallback, check_whole
 from sb3_sparse.engine.masked import clear_moments
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.policies.base import BaseSparsePolicy
+from sb3_sparse.policies.compiled import plain_names
 from sb3_sparse.sparsity.numeric import is_number
 
 Mask = NDArray[np.bool_]
@@ -38,7 +39,10 @@ class RecycleDormantCallback(IntervalCallback):
     linear or convolutional layers. Those of sums, such as the stream of a residual network, are
     left alone.
 
-    Logged: ``redo/dormant/<network>`` (share of its hidden units at the last check, recycled).
+    A check that is due after the last gradient step of a training takes place when it ends.
+
+    Logged: ``redo/dormant/<network>`` (share of its hidden units that the last check found dormant
+    and recycled).
 
     Example::
 
@@ -78,9 +82,6 @@ class RecycleDormantCallback(IntervalCallback):
         sparse_policy_of(self.model, self)
         self._wiring: dict[str, Wiring] | None = None
 
-    def _on_training_end(self) -> None:
-        self._act_if_due()
-
     def act(self, step: int) -> None:
         """Recycle the units that are dormant now."""
         policy, tau = sparse_policy_of(self.model, self), self.tau
@@ -117,7 +118,7 @@ def recycle(
     :param dormant: whether each unit is to be recycled, by the name of its activation function
     :param step: gradient step, which addresses the draw of weights
     """
-    fresh = initial_parameters(policy, step)
+    fresh = initial_state(policy, step)
     layers = _Layers(policy)
     for name, which in dormant.items():
         layers.redraw(wiring[name].incoming, which, fresh)
@@ -133,11 +134,13 @@ class _Layers:
         self.policy = policy
         self.optimizers = policy.sparse.optimizers
         self.kept = {id(layer.module): layer for layer in policy.sparse.layers}
+        parameters = plain_names(dict(policy.named_parameters()))  # of shared ones, the first name
+        self.names = {id(parameter): name for name, parameter in parameters.items()}
 
     def redraw(self, name: str, rows: Mask, fresh: dict[str, th.Tensor]) -> None:
         """Take the incoming weights of units from ``fresh``; set their biases to 0."""
         module = self.policy.get_submodule(name)
-        drawn = fresh[f"{self._known_as(name, fresh)}.weight"].cpu().numpy()
+        drawn = fresh[self.names[id(module.get_parameter("weight"))]].cpu().numpy()
         weight = self._dense(module)
         weight[rows] = drawn[rows]
         where = np.zeros(weight.shape, dtype=np.bool_)
@@ -157,13 +160,6 @@ class _Layers:
         where = np.zeros(weight.shape, dtype=np.bool_)
         where[:, columns] = True
         self._write(module, weight, where)
-
-    def _known_as(self, name: str, fresh: dict[str, th.Tensor]) -> str:
-        """Return the name under which a layer, perhaps a shared one, has fresh values."""
-        if f"{name}.weight" in fresh:
-            return name
-        module = self.policy.get_submodule(name)
-        return next(str(n) for n, m in self.policy.named_modules() if m is module)
 
     def _dense(self, module: nn.Module) -> NDArray[np.float32]:
         """Return a copy of a layer's weight, 0 where inactive."""

@@ -8,10 +8,11 @@ import torch as th
 from stable_baselines3.common.utils import polyak_update
 from torch import nn
 
-from sb3_sparse.callbacks.initial import initial_parameters, sparse_policy_of
+from sb3_sparse.callbacks.initial import initial_state, sparse_policy_of, tensors_by_name
 from sb3_sparse.callbacks.interval import IntervalCallback
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.policies.base import BaseSparsePolicy
+from sb3_sparse.policies.compiled import plain_names
 from sb3_sparse.policies.internals import updates_done
 from sb3_sparse.policies.spec import DENSE_WORDS, in_target, input_layers, matches, output_layers
 
@@ -25,8 +26,9 @@ class ResetCallback(IntervalCallback):
 
     It works beside any topology method, on masked and on sparse storage, between gradient steps,
     which stay fused. Weights are drawn from (mask seed, gradient step), and no global generator
-    advances. The last gradient steps of a training are not followed by a reset: leave enough of
-    them after the last one.
+    advances. A reset that is due after the last round of gradient steps takes place when the
+    training is resumed, so it does not end with an untrained policy; steps that were trained
+    without the callback make none due.
 
     Logged: ``reset/count`` (resets that were due so far).
 
@@ -40,13 +42,16 @@ class ResetCallback(IntervalCallback):
 
     :param interval: gradient steps between two resets
     :param layers: layers to reset, as in ``dense_layers``: the words ``"input"`` and ``"output"``,
-        names, or patterns of names; None: all layers, and all other parameters of the networks
+        names, or patterns of names; None: all layers, and all other parameters and statistics of
+        the networks
     :param verbose: as in SB3
     :raises ConfigError: for a value that is not allowed; when training begins, for a policy that is
         not sparse, an algorithm without a replay buffer, or a pattern that matches no layer
 
     Source: arXiv:2205.07802, section 4.
     """
+
+    acts_at_end = False  # or the training would end with an untrained policy
 
     def __init__(
         self, interval: int = 200_000, *, layers: Sequence[str] | None = None, verbose: int = 0
@@ -64,12 +69,6 @@ class ResetCallback(IntervalCallback):
     def _init_callback(self) -> None:
         super()._init_callback()
         layers_named(sparse_policy_of(self.model, self), self.layers)
-
-    def _on_training_start(self) -> None:
-        super()._on_training_start()
-        # A reset may have been due at the last step of the training before; the same one twice
-        # makes no difference.
-        self._done = max(self._done - max(self.model.gradient_steps, 1), 0)
 
     def act(self, step: int) -> None:
         """Reset the networks now."""
@@ -91,7 +90,7 @@ def layers_named(policy: BaseSparsePolicy, patterns: Sequence[str] | None) -> se
         spec = policy.networks[network.name]
         names = [layer.name for layer in network.layers]
         names += [name for name, _ in network.dense_layers]
-        order = [name for name, _ in policy.named_modules(remove_duplicate=False)]
+        order = list(plain_names(dict(policy.named_modules(remove_duplicate=False))))
         names.sort(key=order.index)
         known += names
         words = {"input": input_layers(policy, spec, names), "output": output_layers(spec, names)}
@@ -111,24 +110,26 @@ def layers_named(policy: BaseSparsePolicy, patterns: Sequence[str] | None) -> se
 def reset(policy: BaseSparsePolicy, names: set[str] | None, step: int) -> None:
     """Initialise a policy's layers anew, with their present masks.
 
-    :param names: names of the layers; None: all, and all other trained parameters
+    :param names: names of the layers; None: all, and all other trained parameters and the
+        statistics of normalisation
     :param step: gradient step, which addresses the draw
     """
-    fresh = initial_parameters(policy, step)
+    fresh = initial_state(policy, step)
     kept = {id(layer.weight): layer for layer in policy.sparse.layers}
-    chosen = {id(p) for name in names or () for p in policy.get_submodule(name).parameters(False)}
-    for name, parameter in policy.named_parameters():
-        left = names is not None and id(parameter) not in chosen
-        if left or in_target(name, policy.networks) or not parameter.requires_grad:
+    chosen = {id(p) for name in names or () for p in policy.get_submodule(name).parameters()}
+    for name, tensor in tensors_by_name(policy):
+        left = names is not None and id(tensor) not in chosen
+        frozen = isinstance(tensor, nn.Parameter) and not tensor.requires_grad
+        if left or frozen or in_target(name, policy.networks):
             continue
-        layer = kept.get(id(parameter))
+        layer = kept.get(id(tensor))
         if layer is not None:
             layer.write(fresh[name])
         else:
             with th.no_grad():
-                parameter.copy_(fresh[name])
+                tensor.copy_(fresh[name])
         for optimizer in policy.sparse.optimizers:
-            optimizer.state.pop(parameter, None)
+            optimizer.state.pop(tensor, None)
     for spec in policy.networks.values():
         if spec.target is not None:
             for root in spec.roots:

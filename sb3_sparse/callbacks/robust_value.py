@@ -19,15 +19,16 @@ from sb3_sparse.sparsity.numeric import is_number
 class RobustValueCallback(IntervalCallback):
     """Learns from returns over several steps, and forgets experience of policies long gone.
 
-    Beside ``SparsityCallback("rigl")`` this is RLx2. It is for SAC, TD3, DDPG and TQC, whether
-    their networks are sparse or not.
+    Beside ``SparsityCallback("rigl")`` this is RLx2. It is for SAC, TD3, DDPG, TQC and CrossQ,
+    whether their networks are sparse or not.
 
     - From ``multi_step_begin`` on, targets are returns over ``multi_step`` steps.
     - Every ``check_interval`` gradient steps, the action means that were stored with the ``oldest``
       transitions are compared with those of the present policy. Their distance is the mean of
       ``(stored - present)² / 2`` over transitions and actions, which are in units of their bound.
       While it exceeds ``distance_threshold``, the compared transitions are forgotten and the next
-      ones compared, but ``min_buffer_size`` transitions stay.
+      ones compared, but ``min_buffer_size`` transitions stay. A comparison that is due after the
+      last gradient step of a training takes place when it ends.
 
     The action mean is what ``predict(deterministic=True)`` returns, and costs one such call an
     environment step. Transitions that SB3 collects at random before ``learning_starts`` get the
@@ -114,8 +115,8 @@ class RobustValueCallback(IntervalCallback):
         actions = model.action_space
         if not isinstance(model, OffPolicyAlgorithm) or not isinstance(actions, spaces.Box):
             raise ConfigError(
-                f"RobustValueCallback needs SAC, TD3, DDPG or TQC, got {type(model).__name__} with "
-                f"{type(actions).__name__} actions"
+                f"RobustValueCallback needs SAC, TD3, DDPG, TQC or CrossQ, got "
+                f"{type(model).__name__} with {type(actions).__name__} actions"
             )
         if not isinstance(model.replay_buffer, DynamicReplayBuffer):
             try:
@@ -126,7 +127,6 @@ class RobustValueCallback(IntervalCallback):
                     "replay_buffer_class and optimize_memory_usage"
                 ) from error
             model.replay_buffer_class = DynamicReplayBuffer
-        self.buffer.gamma = model.gamma
 
     def _on_training_start(self) -> None:
         super()._on_training_start()
@@ -138,13 +138,14 @@ class RobustValueCallback(IntervalCallback):
         progress = self.model.num_timesteps / planned if planned else 1.0
         buffer = self.buffer
         buffer.n_steps = self.multi_step if progress >= self.multi_step_begin else 1
+        buffer.gamma = self.model.gamma
         self.logger.record("robust_value/n_steps", buffer.n_steps)
         self.logger.record("robust_value/buffer_size", buffer.size() * buffer.n_envs)
 
     def _on_training_end(self) -> None:
         # Of a rollout that a callback stopped, the last step was taken but not stored.
         self._store_means(self.model.num_timesteps - self.model.n_envs)
-        self._act_if_due()
+        super()._on_training_end()
 
     def _store_means(self, timesteps: int | None) -> None:
         """Store the action means of the rows that have none yet.
@@ -165,7 +166,19 @@ class RobustValueCallback(IntervalCallback):
         buffer.store_means(means)
 
     def _means(self, rows: NDArray[np.int64]) -> NDArray[np.float32]:
-        """Compute the present action means, shape ``(rows, environments, dim)``."""
+        """Compute the present action means, shape ``(rows, environments, dim)``.
+
+        In parts of ``oldest`` transitions at most, since rows may be those of a whole buffer.
+        """
+        size = self._rows(self.oldest)
+        parts = [self._means_of(rows[at : at + size]) for at in range(0, len(rows), size)]
+        return np.concatenate(parts)
+
+    def _rows(self, transitions: int) -> int:
+        """Return the rows that hold as many transitions, rounded up."""
+        return -(-transitions // self.buffer.n_envs)
+
+    def _means_of(self, rows: NDArray[np.int64]) -> NDArray[np.float32]:
         observations: Any = self.buffer.observations[rows]
         observations = observations.reshape(-1, *(self.model.observation_space.shape or ()))
         normalization = self.model.get_vec_normalize_env()
@@ -179,7 +192,7 @@ class RobustValueCallback(IntervalCallback):
     def act(self, step: int) -> None:
         """Forget the oldest transitions while the policies part, and log their distance."""
         buffer = self.buffer
-        block, least = (-(-n // buffer.n_envs) for n in (self.oldest, self.min_buffer_size))
+        block, least = self._rows(self.oldest), self._rows(self.min_buffer_size)
         if not buffer.size():
             return
         first = distance = self._distance(block)

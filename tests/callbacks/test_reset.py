@@ -63,6 +63,10 @@ def test_everything_is_drawn_anew_but_masks_and_clocks(name, compute):
         assert (np.abs(new)[mask] <= limits[mask]).all()
         assert np.abs(new)[mask].max() > 0.5 * limits[mask].min()
     assert not any(optimizer.state for optimizer in sparse.optimizers)
+    for key, value in after.items():  # the statistics of CrossQ
+        fresh = {"ra_mean": 0, "ra_var": 1, "steps": 0}.get(key.rpartition(".")[2])
+        assert fresh is None or (value == fresh).all(), key
+    assert name != "CrossQ" or sum(key.endswith("ra_mean") for key in after) == 9
     for spec in model.policy.networks.values():
         if spec.target is None:
             continue
@@ -136,7 +140,16 @@ def test_fused_steps_go_on_from_a_reset(name, layers):
         )
 
 
-def test_a_resumed_training_resets_as_the_uninterrupted_one(tmp_path):
+@pytest.mark.parametrize(
+    ("kwargs", "steps", "due"),
+    [
+        ({"gradient_steps": 1}, 30, [10, 20]),
+        ({"gradient_steps": 3}, 17, [12, 21]),  # the second is due in the last round of 7
+        ({"gradient_steps": -1, "train_freq": 4}, 28, [12, 20]),
+        ({"gradient_steps": -1, "train_freq": (1, "episode")}, 400, [200, 400]),
+    ],
+)
+def test_a_resumed_training_resets_as_the_uninterrupted_one(kwargs, steps, due, tmp_path):
     acted = []
 
     class Watch(ResetCallback):
@@ -144,20 +157,35 @@ def test_a_resumed_training_resets_as_the_uninterrupted_one(tmp_path):
             super().act(step)
             acted.append((step, self.model.policy.actor.latent_pi[0].weight.detach().clone()))
 
-    model = make("SAC", learning_starts=10)
-    model.learn(40, callback=Watch(10))
-    assert [step for step, _ in acted] == [10, 20]  # none after the last step
-    whole, acted = acted, []
-    model = make("SAC", learning_starts=10)
-    model.learn(30, callback=Watch(10))  # 20 gradient steps, so the second reset is due
-    assert [step for step, _ in acted] == [10]
+    model = make("SAC", learning_starts=10, **kwargs)
+    model.learn(2 * steps, callback=Watch(10))
+    whole, acted = acted[:2], []
+    assert [step for step, _ in whole] == due
+    model = make("SAC", learning_starts=10, **kwargs)
+    model.learn(steps, callback=Watch(10))  # none after the last step, where the second is due
+    assert [step for step, _ in acted] == due[:1]
     model.save(tmp_path / "model.zip")
     again = stable_baselines3.SAC.load(tmp_path / "model.zip", model.get_env())
     again.replay_buffer = model.replay_buffer
-    again.learn(10, callback=Watch(10), reset_num_timesteps=False)
-    assert [step for step, _ in acted] == [10, 20]
+    again.learn(1, callback=Watch(10), reset_num_timesteps=False)
+    assert [step for step, _ in acted] == due
     for (_, one), (_, two) in zip(whole, acted, strict=True):
         assert th.equal(one, two)
+
+
+def test_steps_without_the_callback_make_no_reset_due():
+    acted = []
+
+    class Watch(ResetCallback):
+        def act(self, step):
+            acted.append(step)
+
+    model = make("SAC", learning_starts=10)
+    model.learn(30)  # 20 gradient steps
+    model.learn(5, callback=Watch(10), reset_num_timesteps=False)
+    assert acted == []
+    model.learn(6, callback=Watch(10), reset_num_timesteps=False)
+    assert acted == [30]
 
 
 def test_what_is_not_allowed_is_refused():

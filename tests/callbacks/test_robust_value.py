@@ -11,13 +11,22 @@ import stable_baselines3
 import torch as th
 from algorithms_support import BOX, Noise, assert_alike, fused, learn, make
 from gymnasium import spaces
-from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
+from stable_baselines3.common.callbacks import (
+    CallbackList,
+    EveryNTimesteps,
+    StopTrainingOnMaxEpisodes,
+)
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import VecNormalize
 
 import sb3_sparse
-from sb3_sparse import RobustValueCallback, SparsityCallback
+from sb3_sparse import (
+    RecycleDormantCallback,
+    ResetCallback,
+    RobustValueCallback,
+    SparsityCallback,
+)
 from sb3_sparse.buffers import DynamicReplayBuffer
 from sb3_sparse.errors import ConfigError
 
@@ -26,15 +35,15 @@ ALGORITHMS = [
     (library, name)
     for library in (stable_baselines3, sb3_sparse)
     for name in ("SAC", "TD3", "DDPG")
-] + [(sb3_contrib, "TQC")]
+] + [(sb3_contrib, "TQC"), (sb3_contrib, "CrossQ")]
 IDS = [f"{library.__name__}.{name}" for library, name in ALGORITHMS]
 each_algorithm = pytest.mark.parametrize(("library", "name"), ALGORITHMS, ids=IDS)
 
 
 def made(library, name, **kwargs):
-    """A model; TQC takes what SAC takes."""
+    """A model; those of sb3-contrib take what SAC takes."""
     cls = getattr(library, name)
-    if name == "TQC":
+    if library is sb3_contrib:
         kwargs = {"learning_starts": 20, "buffer_size": 200, "batch_size": 70, **kwargs}
     return make(cls, name, kwargs.pop("env", Noise(BOX)), **kwargs)
 
@@ -102,6 +111,9 @@ def test_returns_are_over_several_steps_from_their_begin_on():
     assert logged(model, "n_steps") == 4
     assert logged(model, "buffer_size") == 50
     assert model.replay_buffer.gamma == 0.7
+    model.gamma = 0.8
+    trained(model, RobustValueCallback(), steps=2)
+    assert model.replay_buffer.gamma == 0.8
 
 
 @pytest.mark.parametrize("name", ["SAC", "TD3"])
@@ -277,11 +289,38 @@ def test_experience_from_before_the_callback_gets_the_means_of_its_start():
     np.testing.assert_allclose(model.replay_buffer.action_means[:30, 0], expected, atol=1e-6)
 
 
+def test_many_means_are_predicted_in_parts(monkeypatch):
+    model = trained(made(stable_baselines3, "TD3", learning_starts=100), steps=50)
+    seen, predict = [], model.policy.predict
+
+    def watched(observations, **kwargs):
+        seen.append(len(observations))
+        return predict(observations, **kwargs)
+
+    monkeypatch.setattr(model.policy, "predict", watched)
+    callback = RobustValueCallback(oldest=16)
+    callback.init_callback(model)
+    callback.on_training_start({}, {})
+    assert seen == [16, 16, 16, 2]
+    observations = model.replay_buffer.observations[:50, 0]
+    expected = model.policy.scale_action(predict(observations, deterministic=True)[0])
+    np.testing.assert_allclose(model.replay_buffer.action_means[:50, 0], expected, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "callback", [RobustValueCallback(), ResetCallback(), RecycleDormantCallback()]
+)
+def test_inside_a_callback_that_passes_on_steps_only_it_is_refused(callback):
+    inside = EveryNTimesteps(5, CallbackList([callback]))
+    with pytest.raises(ConfigError, match=f"{type(callback).__name__} acts when rollouts begin"):
+        made(stable_baselines3, "SAC").learn(20, inside)
+
+
 @pytest.mark.parametrize(
     ("library", "name", "kwargs", "said"),
     [
-        (sb3_sparse, "DQN", {}, "needs SAC, TD3, DDPG or TQC, got DQN with Discrete actions"),
-        (sb3_sparse, "PPO", {}, "needs SAC, TD3, DDPG or TQC, got PPO"),
+        (sb3_sparse, "DQN", {}, "needs SAC, .*, TQC or CrossQ, got DQN with Discrete actions"),
+        (sb3_sparse, "PPO", {}, "needs SAC, .*, TQC or CrossQ, got PPO"),
         (
             sb3_sparse,
             "SAC",

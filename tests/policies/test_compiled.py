@@ -7,7 +7,7 @@ import torch as th
 from stable_baselines3.common.vec_env import DummyVecEnv
 from support import make
 
-from sb3_sparse import sparsify
+from sb3_sparse import RecycleDormantCallback, ResetCallback, sparsify
 from sb3_sparse.analysis import (
     PlasticityCallback,
     dormant_share,
@@ -97,6 +97,37 @@ def test_a_model_with_a_compiled_part_is_saved_and_loaded(compute, tmp_path):
     wrong["actor.latent_pi.0.weight_mask"] = th.ones_like(wrong["actor.latent_pi.0.weight_mask"])
     with pytest.raises(CorruptStateError, match="the mask of actor.latent_pi.0 has 72 of 72"):
         model.policy.load_state_dict(wrong)
+
+
+@pytest.mark.parametrize("compute", ["masked", "sparse"])
+def test_units_are_recycled_and_networks_reset_where_a_part_is_compiled(compute):
+    models = []
+    for wraps in (False, True):
+        model = make("SAC", learning_starts=10, policy_kwargs=dict(compute=compute))
+        if wraps:
+            actor, head = model.policy.actor, model.policy.critic.qf0
+            actor.latent_pi = th.compile(actor.latent_pi, backend="eager")
+            head[2] = th.compile(head[2], backend="eager")
+        model.learn(20)
+        callbacks = (
+            RecycleDormantCallback(tau=0.9),
+            ResetCallback(),
+            ResetCallback(layers=["output", "critic.qf0.2"]),
+        )
+        for step, callback in enumerate(callbacks):
+            callback.init_callback(model)
+            callback.act(step)
+            model.learn(5, reset_num_timesteps=False)
+            models.append(state_of(model))
+    for plain, wrapped in zip(models[:3], models[3:], strict=True):
+        assert plain.keys() == wrapped.keys()
+        for name, value in wrapped.items():
+            th.testing.assert_close(value, plain[name], rtol=1e-3, atol=1e-5, msg=name)
+
+
+def state_of(model):
+    state = plain_names(model.policy.state_dict())
+    return {name: x.clone() for name, x in state.items() if isinstance(x, th.Tensor)}
 
 
 def test_a_compression_knows_the_model_again():
