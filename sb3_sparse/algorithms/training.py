@@ -16,7 +16,7 @@ from stable_baselines3.common.preprocessing import preprocess_obs
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
-from sb3_sparse.engine.activations import ADJUSTABLE, number_of
+from sb3_sparse.engine.activations import ADJUSTABLE, settings_of
 from sb3_sparse.engine.changes import ChangeDetector, patched
 from sb3_sparse.engine.internals import any_global_hook, module_hooks
 from sb3_sparse.engine.native.library import why_missing
@@ -115,7 +115,7 @@ class Training:
     def _settings_now(self) -> list[Any]:
         """Collect what may change while modules, tensors and attributes stay the same."""
         distributions = [attributes["action_dist"] for attributes in self._acting]
-        return [*map(number_of, self._adjustable), *distributions, *map(type, distributions)]
+        return [*map(settings_of, self._adjustable), *distributions, *map(type, distributions)]
 
     def machine(
         self,

@@ -144,7 +144,7 @@ def _follow(headline: str, engine: Callable[..., Outcome]) -> None:
 
 def _headline(run: RunSpec) -> str:
     settings = run.settings()
-    kwargs, method = settings.policy_kwargs, run.preset or settings.method
+    kwargs, method = settings.policy_kwargs, run.name_of(settings)
     if run.match_params is not None:
         how = f"dense with the parameters of {run.match_params:.0%}"
     elif method == "dense":

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from torch import nn
 from torch.compiler import is_compiling
 
-from sb3_sparse.engine.activations import ADJUSTABLE, number_of
+from sb3_sparse.engine.activations import ADJUSTABLE, number_of, settings_of
 from sb3_sparse.engine.buffer import FloatBuffer
 from sb3_sparse.engine.chains import watched
 from sb3_sparse.engine.changes import patched
@@ -69,7 +69,7 @@ class Binding(NamedTuple):
     tensors: list[int]
     sizes: list[th.Size]
     structures: list[Structure]
-    activations: list[tuple[int, float, float]]
+    settings: list[tuple[Any, ...]]
     arguments: Any
     held: list[th.Tensor]
 
@@ -89,8 +89,8 @@ class Inference:
         self._total = sum(self._widths)
         self._layers = [step.layer for step in steps]
         self._sparse = [layer for layer in self._layers if isinstance(layer, SparseLinear)]
-        self._activations = [step.activation for step in steps if step.activation is not None]
-        self._adjustable = [m for m in self._activations if isinstance(m, ADJUSTABLE)]
+        around = [module for step in steps for module in (step.activation, step.norm)]
+        self._adjustable = [m for m in around if isinstance(m, ADJUSTABLE)]
         self._targets = [layer for layer in self._sparse if layer.is_target]
         hooks = ((vars(m)["_forward_hooks"], vars(m)["_forward_pre_hooks"]) for m in modules)
         self._hooks = list(chain.from_iterable(hooks))
@@ -216,14 +216,14 @@ class Inference:
         tensors = [tensor.data_ptr() for tensor in self._tensors]
         sizes = list(map(th.Tensor.size, self._tensors))
         structures = [layer.structure for layer in self._sparse]
-        activations = [number_of(module) for module in self._adjustable]
+        settings = list(map(settings_of, self._adjustable))
         binding = self._binding
         if (
             binding is not None
             and tensors == binding.tensors
             and sizes == binding.sizes
             and structures == binding.structures
-            and activations == binding.activations
+            and settings == binding.settings
             and all(map(th.Tensor.is_contiguous, self._tensors))
         ):
             return binding
@@ -250,7 +250,7 @@ class Inference:
             [tensor.data_ptr() for tensor in held],
             [tensor.size() for tensor in held],
             structures,
-            [number_of(module) for module in self._adjustable],
+            list(map(settings_of, self._adjustable)),
             arguments,
             held,
         )

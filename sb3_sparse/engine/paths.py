@@ -71,11 +71,16 @@ def _split(path: Iterable[nn.Module], parts: list[Part]) -> bool:
 
 def _split_residual(module: Residual, parts: list[Part]) -> bool:
     before = len(parts)
-    if type(module).forward is not Residual.forward or not _split([module.residual], parts):
+    inner: list[Part] = []  # of its own, so that no activation belongs to a layer before the block
+    if type(module).forward is not Residual.forward or not _split([module.residual], inner):
         return False
-    if len(parts) == before or parts[-1].layer is None or parts[-1].shortcut is not None:
+    if not inner or inner[-1].layer is None or inner[-1].shortcut is not None:
         return False
-    parts[-1] = parts[-1]._replace(shortcut=before - 1)
+    shifted = [
+        part if part.shortcut is None else part._replace(shortcut=part.shortcut + before)
+        for part in inner
+    ]
+    parts += [*shifted[:-1], shifted[-1]._replace(shortcut=before - 1)]
     return True
 
 

@@ -7,6 +7,7 @@ from torch import nn
 from sb3_sparse.engine.activations import ACTIVATIONS
 from sb3_sparse.engine.linear import SparseLinear
 from sb3_sparse.engine.paths import parts_of
+from sb3_sparse.engine.residual import Residual
 from sb3_sparse.fused.errors import NotCovered
 from sb3_sparse.fused.program import Parts
 
@@ -35,5 +36,14 @@ def parts(*modules: nn.Module) -> Parts:
         if others:
             raise NotCovered(f"a network with {', '.join(sorted(others))}")
         order = ", ".join(type(m).__name__ for m in leaves)
-        raise NotCovered(f"a network of {order} in this order")
+        own = [
+            type(m).__name__
+            for module in modules
+            for m in module.modules()
+            if [*m.children()] and not isinstance(m, nn.Sequential) and type(m) is not Residual
+            and type(m).forward is not Residual.forward
+        ]  # fmt: skip
+        raise NotCovered(
+            f"a network with {own[0]}" if own else f"a network of {order} in this order"
+        )
     return found

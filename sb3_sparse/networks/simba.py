@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from torch import nn
 
@@ -26,12 +26,12 @@ class SimbaBlock(Residual):
         SimbaBlock(128)(th.zeros(1, 128)).shape  # (1, 128)
 
     :param width: number of inputs and of outputs
-    :param activation_fn: activation between the linear layers
+    :param activation_fn: makes the activation between the linear layers
 
     Source: arXiv:2410.09754, section 4.
     """
 
-    def __init__(self, width: int, activation_fn: type[nn.Module] = nn.ReLU) -> None:
+    def __init__(self, width: int, activation_fn: Callable[[], nn.Module] = nn.ReLU) -> None:
         super().__init__(
             nn.LayerNorm(width, eps=EPSILON),
             nn.Linear(width, EXPANSION * width),
@@ -41,7 +41,7 @@ class SimbaBlock(Residual):
 
 
 def simba(
-    inputs: int, net_arch: Sequence[int], activation_fn: type[nn.Module] = nn.ReLU
+    inputs: int, net_arch: Sequence[int], activation_fn: Callable[[], nn.Module] = nn.ReLU
 ) -> nn.Sequential:
     """Build a SimBa network without its head: a linear layer, blocks, and a LayerNorm.
 
@@ -54,7 +54,7 @@ def simba(
 
     :param inputs: number of inputs
     :param net_arch: one entry a block, all equal: the width of the network
-    :param activation_fn: activation within each block
+    :param activation_fn: makes the activation within a block
     :raises ConfigError: if there is no block, or if widths differ
 
     Source: arXiv:2410.09754, section 4; ``net_arch`` as in SBX.

@@ -162,7 +162,7 @@ SparseActorCriticMlpPolicy, SparseActorCriticCnnPolicy, SparseActorCriticMultiIn
 class SparseActorCriticSimbaPolicy(SimbaPolicy, SparseActorCriticPolicy):
     """Sparse SimBa networks for PPO, A2C and TRPO.
 
-    ``ortho_init`` concerns the output layers alone.
+    ``ortho_init`` affects only the output layers.
 
     Example::
 
@@ -173,17 +173,21 @@ class SparseActorCriticSimbaPolicy(SimbaPolicy, SparseActorCriticPolicy):
     """
 
     default_arch = {"pi": [128], "vf": [256, 256]}
+    default_optimizer_kwargs = {"eps": 1e-5}  # as SB3 has it for Adam
 
     def _build_mlp_extractor(self) -> None:
         super()._build_mlp_extractor()
         extractor: Any = self.mlp_extractor
         for name in ("policy_net", "value_net"):
-            perceptron = getattr(extractor, name)
-            setattr(extractor, name, with_simba(perceptron, len(perceptron) // 2).to(self.device))
+            network = with_simba(getattr(extractor, name), has_output=False)
+            setattr(extractor, name, network.to(self.device))
 
     def _build(self, lr_schedule: Schedule) -> None:
         super()._build(lr_schedule)
         initialise(self.mlp_extractor)  # SB3 has drawn all layers anew for ortho_init
+        if not self.ortho_init:
+            initialise(self.action_net)
+            initialise(self.value_net)
 
     def _initial_gain(self, layer_name: str) -> float:
         if self.ortho_init and layer_name in ("action_net", "value_net"):

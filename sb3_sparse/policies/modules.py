@@ -39,8 +39,8 @@ class SparseModule(DenseVectors, FastModeSwitch):
     def save(self, path: Any) -> None:
         """Save the module without the policy, as in SB3, with dense weights, 0 where inactive.
 
-        ``Actor.load(path)`` of SB3's own class gives a dense module that acts the same. Save the
-        policy or the model to keep the masks.
+        ``Actor.load(path)`` of SB3's own class gives a dense module that acts the same; a SimBa
+        network is loaded by its own class. Save the policy or the model to keep the masks.
 
         :param path: file to write
         """

@@ -16,7 +16,6 @@ NAMES = {
     "granet": "GraNet",
     "mst": "MST",
     "rlx2": "RLx2",
-    "simba": "SimBa, static",
 }
 
 

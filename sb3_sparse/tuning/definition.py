@@ -46,7 +46,7 @@ class Definition:
     @property
     def method(self) -> str:
         """The method or preset that is tuned."""
-        return self.run.preset or self.run.settings().method
+        return self.run.name_of(self.run.settings())
 
     @property
     def default_name(self) -> str:

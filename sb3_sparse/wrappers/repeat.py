@@ -14,8 +14,10 @@ class ActionRepeat(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorA
     """Takes each action several times, and returns the sum of the rewards.
 
     A step of the wrapped environment is a decision: with ``repeat=2``, an episode of 1000 steps has
-    500 decisions, and every count of SB3 and rl-zoo (``n_timesteps``, ``learning_starts``,
-    ``eval_freq``) is one of decisions. An episode that ends between two repetitions ends there.
+    500 decisions, and SB3 and rl-zoo count decisions (``n_timesteps``, ``learning_starts``,
+    ``eval_freq``). Lengths of episodes (``ep_len_mean``, ``monitor.csv``) count steps of the
+    wrapped environment, since rl-zoo puts its monitor around that one. An episode that ends between
+    two repetitions ends there.
 
     Example::
 

@@ -27,8 +27,6 @@ SQUASHED = "actor.mu."
 """Output layers of TD3's actor and of actors with gSDE, which an activation follows."""
 
 IMPALA_BLOCK = ".layers."
-SIMBA_END = ".residual.3"
-"""The last layer of a SimBa block."""
 
 
 @dataclass(frozen=True)
@@ -142,9 +140,17 @@ def _identity(state: Mapping[str, Any], name: str) -> tuple[str, bytes]:
 
 def _behind(name: str, state: Mapping[str, Any], specs: Mapping[str, NetworkSpec]) -> int:
     """Return the FLOPs for each output of a layer of what comes behind it."""
-    sum_or_activation = name.endswith(SIMBA_END) or _activated(name, state, specs)
+    sum_or_activation = _ends_residual(name, state) or _activated(name, state, specs)
     scale_and_shift = 2
     return sum_or_activation + (NORM_FLOPS + scale_and_shift) * _normalised(name, state)
+
+
+def _ends_residual(name: str, state: Mapping[str, Any]) -> bool:
+    """Whether a layer is the last of a residual block, so that a sum comes next."""
+    module, _, number = name.rpartition(".")
+    return module.endswith(".residual") and not any(
+        _number(key, module) > int(number) for key in state
+    )
 
 
 def _normalised(name: str, state: Mapping[str, Any]) -> bool:

@@ -52,7 +52,7 @@ class Prepared:
         """Return the entries that ``sparsity.json`` has from the start of the run."""
         match = {} if self.match is None else {"match": asdict(self.match)}
         return {
-            "method": run.preset or self.settings.method,
+            "method": run.name_of(self.settings),
             "run": run.as_dict(),
             "settings": self.settings,
             "evaluation": self.evaluation,

@@ -171,8 +171,16 @@ class RunSpec:
 
     @property
     def preset(self) -> str | None:
-        """The preset that the settings come from; reports call the run's method by its name."""
+        """The preset that the settings come from."""
         return self._method if self._method is not None and is_preset(self._method) else None
+
+    def name_of(self, settings: Settings) -> str:
+        """Return what reports call the method: a preset that says how masks move, or the method.
+
+        :param settings: the run's settings
+        """
+        preset = self.preset
+        return preset if preset and settings.callback is not None else settings.method
 
     def config_entry(self) -> dict[str, Any]:
         """Return a copy of the config's entry for the environment.
