@@ -215,13 +215,13 @@ def test_an_unknown_study_is_answered_with_the_nearest_and_all_names():
         Study.read("figure_7", "small")
 
 
-def test_every_study_of_the_issue_is_shipped():
+def test_the_studies_that_are_shipped():
     assert set(study_names()) == {
         *("sac", "ppo", "dqn_cnn", "dqn_resnet", "classic_control"),
         *("parameters_sac", "parameters_ppo", "parameters_dqn"),
         *("actor_critic", "distribution", "weight_decay", "initialisation", "drop_fraction"),
         *("update_interval", "batch_size", "last_layer_dense", "snr", "noise", "flops"),
-        *("robust_value", "scaling"),
+        *("robust_value", "scaling", "simba"),
     }
 
 
