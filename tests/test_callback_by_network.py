@@ -66,7 +66,7 @@ def test_one_method_takes_options_by_network_too():
         (
             {"actor": "static", "critic": "prune"},
             dict(drop_fraction=0.2),
-            "method 'actor=static, critic=prune' has no drop_fraction",
+            "method 'critic=prune' has no drop_fraction",
         ),
         ({"critic": "rigl"}, dict(update_interval={"critic": 0}), "critic: update_interval must"),
         ({"critic": "rigl"}, dict(end={"critic": "late"}), "critic: begin and end are fractions"),

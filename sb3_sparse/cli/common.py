@@ -50,7 +50,8 @@ GymPackages = Annotated[
 Method = Annotated[
     str | None,
     option(
-        "dense, prune, static, set, rigl, granet, actor=static,critic=rigl, or a preset (simba).",
+        "dense, prune, static, set, rigl, granet, critic=rigl (a method for each "
+        "network), or a preset: mst, rlx2, simba.",
         shown="rigl",
     ),
 ]

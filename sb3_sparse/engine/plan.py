@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from sb3_sparse.errors import ConfigError, warn
 from sb3_sparse.sparsity.numeric import is_number, is_whole
 from sb3_sparse.sparsity.schedules import cosine_drop_fraction
-from sb3_sparse.topology import MaskUpdate, TopologyMethod, method_named
+from sb3_sparse.topology import MaskUpdate, TopologyMethod, method_named, method_names
 
 UPDATE_ON = ("step", "rollout")
 
@@ -82,8 +82,10 @@ def warn_of_no_plan(sparsity: float) -> None:
 
     :param sparsity: its present sparsity
     """
+    pruning = [name for name in method_names() if method_named(name).reaches_final]
+    either = " or ".join(f"SparsityCallback({name!r})" for name in pruning)
     warn(
         f"the policy trains at sparsity {sparsity:.3g}, denser than requested, and nothing prunes "
-        "it: pass SparsityCallback('prune') to learn(), or leave out "
-        "initial_sparsity to start at the requested sparsity"
+        f"it: pass {either} to learn(), or leave out initial_sparsity to start at the requested "
+        "sparsity"
     )

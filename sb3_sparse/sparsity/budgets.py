@@ -10,7 +10,7 @@ from sb3_sparse.sparsity.numeric import is_number
 
 
 def feasible_actor_share(
-    actor_size: int, critics_size: int, sparsity: float
+    actor_size: float, critics_size: float, sparsity: float
 ) -> tuple[float, float]:
     """Smallest and largest actor share at which no network would get more than it has.
 

@@ -14,9 +14,9 @@ from sb3_sparse.topology.registry import method_named
 STATIC = "static"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Methods:
-    """One method for all networks of a policy, or one for each.
+    """One method for all networks of a policy, or one for each. They are equal if labels are.
 
     Example::
 
@@ -71,7 +71,7 @@ class Methods:
             if not (network and equals and method) or network in named:
                 raise ConfigError(
                     "methods by network are given as network=method, each network once, e.g. "
-                    f"actor=static,critic=rigl; got {text!r}"
+                    f"actor=set,critic=rigl; got {text!r}"
                 )
             named[network] = method
         return cls.of(named)
@@ -81,10 +81,18 @@ class Methods:
 
     @property
     def label(self) -> str:
-        """The method's name, or the methods by network in alphabetical order."""
-        if not self.named:
-            return self.usual
-        return ", ".join(f"{network}={name}" for network, name in sorted(self.named.items()))
+        """The method's name, or the methods by network in alphabetical order.
+
+        Networks that have the usual method are left out, as ``Methods.of`` takes them.
+        """
+        named = sorted(item for item in self.named.items() if item[1] != self.usual)
+        return ", ".join(f"{network}={name}" for network, name in named) or self.usual
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Methods) and self.label == other.label
+
+    def __hash__(self) -> int:
+        return hash(self.label)
 
     @property
     def options(self) -> frozenset[str]:
@@ -93,12 +101,10 @@ class Methods:
         return frozenset().union(*(method_named(name).options for name in names))
 
     @property
-    def leading(self) -> str:
-        """The method of the first network, by name, whose masks may move; static if none may."""
-        if not self.named:
-            return self.usual
-        names = (name for _, name in sorted(self.named.items()))
-        return next((name for name in names if method_named(name).options), STATIC)
+    def moving(self) -> tuple[str, ...]:
+        """The methods that may move masks, in the order of their networks' names."""
+        names = [name for _, name in sorted(self.named.items())] or [self.usual]
+        return tuple(name for name in names if method_named(name).options)
 
     @property
     def start_dense(self) -> bool:

@@ -65,7 +65,22 @@ def wide_space(method: str, sizes: Mapping[str, int], sparsity: float | None) ->
         searched["drop_fraction"] = FloatDistribution(0.0, 0.5)
     searched["distribution"] = CategoricalDistribution(("erk", "uniform"))
     if sizes.keys() == {"actor", "critic"} and sparsity is not None:
-        low, high = feasible_actor_share(sizes["actor"], sizes["critic"], sparsity)
+        low, high = feasible_actor_share(*_room(methods, sizes, sparsity))
         low, high = max(low, ACTOR_SHARE[0]), min(high, ACTOR_SHARE[1])
-        searched["actor_share"] = FloatDistribution(round(low + 5e-5, 4), round(high - 5e-5, 4))
+        low, high = round(low + 5e-5, 4), round(high - 5e-5, 4)
+        if low < high:
+            searched["actor_share"] = FloatDistribution(low, high)
     return Space("wide", searched)
+
+
+def _room(
+    methods: Methods, sizes: Mapping[str, int], sparsity: float
+) -> tuple[float, float, float]:
+    """Return what the actor and the critics may keep at the end, and the sparsity of that.
+
+    A network must not end with more connections than it starts with, where methods prune.
+    """
+    starts = methods.initial_sparsity(sparsity)
+    by_network = starts if isinstance(starts, Mapping) else dict.fromkeys(sizes, starts or 0.0)
+    actor, critic = (sizes[n] * (1 - by_network.get(n, 0.0)) for n in ("actor", "critic"))
+    return actor, critic, 1 - (1 - sparsity) * sum(sizes.values()) / (actor + critic)

@@ -64,6 +64,12 @@ def config_path(method: str, algo: str) -> Path:
     return path
 
 
+def entries_of(folder: str) -> list[dict[str, Any]]:
+    """Return the settings of all environments in all files of a shipped folder."""
+    files = sorted((config_root() / folder).glob("*.yml"))
+    return [entry for file in files for entry in read_yaml(file).values()]
+
+
 def read_yaml(path: Path, what: str = "environment ids to settings") -> dict[str, Any]:
     """Return the mapping in a YAML file.
 

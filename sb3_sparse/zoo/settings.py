@@ -15,7 +15,13 @@ from sb3_sparse.errors import ConfigError, did_you_mean
 from sb3_sparse.policies.arguments import arguments_of, import_path
 from sb3_sparse.policies.registry import SparsePolicy, SparseSimbaPolicy, policy_named
 from sb3_sparse.topology import Methods
-from sb3_sparse.zoo.callbacks import listed, named, robust_value_of, with_robust_value
+from sb3_sparse.zoo.callbacks import (
+    listed,
+    named,
+    package_callback,
+    robust_value_of,
+    with_robust_value,
+)
 from sb3_sparse.zoo.configs import DENSE
 
 if TYPE_CHECKING:  # imported when settings are checked, not when names are read
@@ -154,7 +160,7 @@ class Settings(Mapping[str, Any]):
     def method(self) -> str:
         """The topology method; ``"static"`` without a callback, ``"dense"`` at sparsity 0.
 
-        Methods by network read ``"actor=static, critic=rigl"``.
+        Methods by network read ``"actor=set, critic=rigl"``; static networks are left out.
 
         :raises ConfigError: if the policy is not sparse
         """
@@ -165,6 +171,16 @@ class Settings(Mapping[str, Any]):
         sparsity = self.policy_kwargs.get("sparsity")
         shares = list(sparsity.values()) if isinstance(sparsity, Mapping) else [sparsity]
         return DENSE if all(share == 0.0 for share in shares) else "static"
+
+    @property
+    def kind(self) -> tuple[str, str, tuple[str, ...]]:
+        """What a preset stands for: the policy's alias, the method, and further callbacks.
+
+        :raises ConfigError: as :attr:`alias` and :attr:`callback`
+        """
+        alias, method = self.alias, self.method
+        paths = [path for path, _ in named(self._content) if _is_own(path) is None]
+        return alias, method, tuple(sorted(package_callback(path) or path for path in paths))
 
     def changed(self, overrides: Mapping[str, Any], algorithm: type[BaseAlgorithm]) -> Settings:
         """Return these settings with each override in its place: a callback, policy or algorithm.
@@ -181,9 +197,7 @@ class Settings(Mapping[str, Any]):
         names = Names.of(algorithm, self.replaced(policy=policy).alias)
         for name, value in overrides.items():
             if name in names.algorithm:
-                known = content.get(name)
-                both = isinstance(known, Mapping) and isinstance(value, Mapping)
-                content[name] = {**known, **value} if both and known else value
+                content[name] = _merged(content.get(name), value)
             elif name in names.policy:
                 content["policy_kwargs"] = {**_policy_kwargs(content), name: value}
             elif name in names.schedule:
@@ -192,7 +206,7 @@ class Settings(Mapping[str, Any]):
                     raise ConfigError(
                         f"{name} means nothing here: these settings train without {CALLBACK}"
                     )
-                found[1][name] = value
+                found[1][name] = _merged(found[1].get(name), value)
             elif name in names.robust_value:
                 content["callback"] = with_robust_value(content, name, value)
             else:
@@ -324,6 +338,12 @@ class Names:
     def all(self) -> frozenset[str]:
         """The names of all owners."""
         return self.algorithm | self.policy | self.schedule | self.robust_value
+
+
+def _merged(known: Any, value: Any) -> Any:
+    """Return a value in the place of a known one; a mapping of a mapping is merged into it."""
+    both = isinstance(known, Mapping) and isinstance(value, Mapping)
+    return {**known, **value} if both else value
 
 
 def _listed(names: Iterable[str]) -> str:

@@ -17,7 +17,15 @@ from sb3_sparse.sparsity.distributions import check_distribution, check_sparsity
 from sb3_sparse.sparsity.numeric import is_whole
 from sb3_sparse.topology import Methods
 from sb3_sparse.zoo.arguments import MAPPING, Kind
-from sb3_sparse.zoo.configs import DENSE, config_path, entry_of, evaluation_of, is_preset
+from sb3_sparse.zoo.configs import (
+    DENSE,
+    config_folders,
+    config_path,
+    entries_of,
+    entry_of,
+    evaluation_of,
+    is_preset,
+)
 from sb3_sparse.zoo.environments import (
     import_packages,
     is_atari,
@@ -151,7 +159,10 @@ class RunSpec:
         if self._has_own_file:
             return Path(str(self.conf_file))
         by_network = self._by_network
-        folder = self._method or "rigl" if by_network is None else by_network.leading
+        folder = self._method or "rigl"
+        if by_network is not None:
+            shipped = config_folders()
+            folder = next((name for name in by_network.moving if name in shipped), "static")
         return config_path(folder, self.conf_file or self.algo)
 
     @property
@@ -202,6 +213,8 @@ class RunSpec:
         settings = Settings(self.config_entry())
         method = settings.method
         from_preset = self.preset and (self.entry is not None or not self._has_own_file)
+        if self.preset and self.entry is not None:
+            self._check_entry_of(self.preset, settings)
         if self.method not in (None, method) and not from_preset:
             raise ConfigError(
                 f"{self.config} trains with method {method!r}, not {self.method!r}; leave --method "
@@ -237,6 +250,17 @@ class RunSpec:
                 "give -n"
             )
         return settings.replaced(n_timesteps=int(settings["n_timesteps"]))
+
+    def _check_entry_of(self, preset: str, settings: Settings) -> None:
+        """Require of an entry given for a preset that it is one of its kind."""
+        entries = (Settings(entry) for entry in entries_of(preset))
+        if settings.kind not in {one.kind for one in entries}:
+            policy, method, callbacks = settings.kind
+            beside = f" and the callbacks {', '.join(callbacks)}" if callbacks else ""
+            raise ConfigError(
+                f"the entry trains {policy} with method {method!r}{beside}, which is not the "
+                f"preset {preset!r}; give its own method, or take the preset's entry"
+            )
 
     def evaluation(self) -> dict[str, int]:
         """Return ``eval_freq`` and ``eval_episodes``."""

@@ -11,15 +11,15 @@ from typing import Any
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
+from sb3_sparse import callbacks
 from sb3_sparse.callback import SparsityCallback
-from sb3_sparse.callbacks import RobustValueCallback
 from sb3_sparse.engine.optimizers import check_weight_decay
 from sb3_sparse.errors import ConfigError, did_you_mean
-from sb3_sparse.policies.arguments import import_classes
+from sb3_sparse.policies.arguments import arguments_of, import_classes
 from sb3_sparse.policies.config import SPARSITY_MISSING, SparsityConfig
 from sb3_sparse.topology import Methods
 from sb3_sparse.zoo.arguments import kind_of
-from sb3_sparse.zoo.callbacks import ROBUST_VALUE
+from sb3_sparse.zoo.callbacks import ROBUST_VALUE, package_callbacks
 from sb3_sparse.zoo.settings import CALLBACK, SET_BY_THE_RUN, Names, Settings
 
 OF_SPARSITY = frozenset(one.name for one in fields(SparsityConfig))
@@ -39,11 +39,13 @@ def check_settings(settings: Settings, algorithm: type[BaseAlgorithm]) -> None:
     if callback is not None and not settings.has_own_callback:
         allowed = names.schedule | {"method", "verbose"}
         _check_keys(callback, allowed, f"{CALLBACK} has no argument", names)
-    robust_value = settings.robust_value
-    if robust_value is not None:
-        allowed = names.robust_value | {"verbose"}
-        _check_keys(robust_value, allowed, f"{ROBUST_VALUE} has no argument", names)
-    parts = (settings, kwargs, callback, robust_value, kwargs.get("optimizer_kwargs"))
+    named = package_callbacks(settings)
+    ours = [(path, getattr(callbacks, name), given) for path, name, given in named]
+    for path, kind, given in ours:
+        _check_keys(given, arguments_of(kind), f"{path} has no argument", names)
+        for name, value in given.items():
+            _check_no_text_for_a_number(name, value)
+    parts = (settings, kwargs, callback, kwargs.get("optimizer_kwargs"))
     for name, value in chain.from_iterable((part or {}).items() for part in parts):
         _check_value(algo.lower(), name, value)
     import_classes(dict(kwargs))
@@ -63,8 +65,8 @@ def check_settings(settings: Settings, algorithm: type[BaseAlgorithm]) -> None:
     check_weight_decay(kwargs.get("weight_decay", 0.0), kwargs.get("optimizer_kwargs"))
     if callback is not None and not settings.has_own_callback:
         SparsityCallback(**callback).plans.check(networks)
-    if robust_value is not None:
-        RobustValueCallback(**robust_value)
+    for _, kind, given in ours:
+        kind(**given)
     _check_start(kwargs, settings.methods, networks)
 
 
@@ -88,14 +90,18 @@ def _check_keys(given: Mapping[str, Any], allowed: Set[str], what: str, names: N
 
 
 def _check_value(algo: str, name: str, value: Any) -> None:
+    _check_no_text_for_a_number(name, value)
+    kind = kind_of(algo, name)
+    if kind is not None and not kind.fits(value):
+        raise ConfigError(f"{name} must be {kind.allowed}; got {value!r}")
+
+
+def _check_no_text_for_a_number(name: str, value: Any) -> None:
     if isinstance(value, str) and _is_number(value):
         raise ConfigError(
             f"{name} is the text {value!r}, as YAML reads a number without a dot and a sign; write "
             f"{name}: !!float {value}"
         )
-    kind = kind_of(algo, name)
-    if kind is not None and not kind.fits(value):
-        raise ConfigError(f"{name} must be {kind.allowed}; got {value!r}")
 
 
 def _is_number(text: str) -> bool:

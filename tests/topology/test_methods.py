@@ -11,23 +11,29 @@ from sb3_sparse.topology import Methods
 def test_one_name_is_every_networks_method():
     methods = Methods.of("rigl")
     assert methods["actor"].name == methods["critic"].name == "rigl"
-    assert methods.label == methods.leading == "rigl"
+    assert methods.label == "rigl"
+    assert methods.moving == ("rigl",)
 
 
 def test_a_network_without_a_name_is_static():
     methods = Methods.of({"critic": "rigl"})
     assert methods["critic"].name == "rigl"
     assert methods["actor"].name == "static"
-    assert methods.leading == "rigl"
+    assert methods.moving == ("rigl",)
 
 
-def test_the_label_does_not_depend_on_the_order_and_reads_back():
-    one = Methods.of({"critic": "rigl", "actor": "static"})
-    two = Methods.of({"actor": "static", "critic": "rigl"})
-    assert one.label == two.label == "actor=static, critic=rigl"
-    for text in (one.label, "critic=rigl,actor=static", " actor = static,critic=rigl "):
+def test_the_label_depends_neither_on_the_order_nor_on_static_networks_and_reads_back():
+    one = Methods.of({"critic": "rigl", "actor": "set"})
+    assert one.label == "actor=set, critic=rigl"
+    for text in (one.label, "critic=rigl,actor=set", " actor = set,critic=rigl "):
         assert Methods.parse(text) == one
-    assert Methods.parse("set") == Methods.of("set")
+    mst = Methods.of({"actor": "static", "critic": "rigl"})
+    assert mst.label == "critic=rigl"
+    assert mst == Methods.of({"critic": "rigl"}) == Methods.parse("actor=static,critic=rigl")
+    assert hash(mst) == hash(Methods.of({"critic": "rigl"}))
+    assert mst != Methods.of({"actor": "rigl"})
+    assert Methods.of({"actor": "static", "critic": "static"}) == Methods.of("static")
+    assert Methods.parse("set") == Methods.of("set") != Methods.of("rigl")
 
 
 def test_options_are_those_of_any_method():
@@ -37,9 +43,10 @@ def test_options_are_those_of_any_method():
     assert Methods.of({"actor": "static"}).options == frozenset()
 
 
-def test_the_first_method_that_moves_leads():
-    assert Methods.of({"critic": "set", "actor": "prune"}).leading == "prune"
-    assert Methods.of({"critic": "static", "actor": "static"}).leading == "static"
+def test_methods_that_move_are_those_of_the_networks_in_order():
+    assert Methods.of({"critic": "set", "actor": "prune"}).moving == ("prune", "set")
+    assert Methods.of({"critic": "set", "actor": "static"}).moving == ("set",)
+    assert Methods.of("static").moving == Methods.of({"critic": "static"}).moving == ()
 
 
 @pytest.mark.parametrize(
@@ -88,5 +95,5 @@ def test_what_is_no_method_is_named(given, message):
     "text", ["actor=", "=rigl", "actor=rigl,", "actor=rigl,set", "a=set,a=set"]
 )
 def test_a_text_of_another_form_is_refused_with_an_example(text):
-    with pytest.raises(ConfigError, match="actor=static,critic=rigl; got"):
+    with pytest.raises(ConfigError, match="actor=set,critic=rigl; got"):
         Methods.parse(text)

@@ -23,7 +23,7 @@ from sb3_sparse.zoo.settings import CALLBACK, Settings
 from sb3_sparse.zoo.spec import RunSpec
 
 MST = {"actor": "static", "critic": "rigl"}
-LABEL = "actor=static, critic=rigl"
+LABEL = "critic=rigl"
 QUICK = {"n_timesteps": 200, "eval_freq": 100, "eval_episodes": 1}
 SMALL = {"learning_starts": 50, "net_arch": [8], "batch_size": 16, "buffer_size": 500}
 
@@ -36,7 +36,10 @@ def callback_of(settings):
     return settings["callback"][0][CALLBACK]
 
 
-@pytest.mark.parametrize("method", [MST, "actor=static,critic=rigl", "critic=rigl , actor=static"])
+@pytest.mark.parametrize(
+    "method",
+    [MST, LABEL, {"critic": "rigl"}, "actor=static,critic=rigl", "critic=rigl , actor=static"],
+)
 def test_methods_by_network_are_named_in_one_way(method):
     run = pendulum(method=method)
     assert run.method == LABEL
@@ -48,7 +51,7 @@ def test_methods_by_network_are_named_in_one_way(method):
 def test_settings_are_those_of_the_first_method_that_moves():
     settings = pendulum(method=MST, sparsity=0.8).settings()
     rigl = pendulum(method="rigl", sparsity=0.8).settings()
-    assert callback_of(settings) == {**callback_of(rigl), "method": MST}
+    assert callback_of(settings) == {**callback_of(rigl), "method": {"critic": "rigl"}}
     assert settings.policy_kwargs == rigl.policy_kwargs
     without = {name: value for name, value in settings.items() if name != "callback"}
     assert without == {name: value for name, value in rigl.items() if name != "callback"}
@@ -61,8 +64,7 @@ def test_networks_start_as_their_methods_usually_do():
     half = pendulum(method={"critic": "prune"}, sparsity=0.8).settings()
     assert half.policy_kwargs["initial_sparsity"] == {"critic": 0.0}
     still = pendulum(method={"actor": "static", "critic": "static"}).settings()
-    assert callback_of(still) == {"method": {"actor": "static", "critic": "static"}}
-    assert "initial_sparsity" not in still.policy_kwargs
+    assert still == pendulum(method="static").settings()
 
 
 def test_a_network_that_the_policy_lacks_is_named_before_anything_is_trained():
@@ -72,15 +74,60 @@ def test_a_network_that_the_policy_lacks_is_named_before_anything_is_trained():
         pendulum(hyperparams={"initial_sparsity": {"critics": 0.1}}).settings()
 
 
+def test_a_method_of_ones_own_leads_to_the_config_of_a_shipped_one():
+    mixed = pendulum(method={"actor": "least-index", "critic": "set"})
+    assert mixed.config == config_path("set", "sac")
+    own = pendulum(method={"critic": "least-index"})
+    assert own.config == config_path("static", "sac")
+    assert callback_of(own.settings()) == {"method": {"critic": "least-index"}}
+
+
+def test_options_by_network_are_merged_into_known_ones():
+    run = pendulum(method="rigl", hyperparams={"update_interval": {"actor": 2000, "critic": 500}})
+    changed = run.settings().changed({"update_interval": {"critic": 7}}, SAC)
+    assert changed.callback["update_interval"] == {"actor": 2000, "critic": 7}
+    assert run.settings().changed({"update_interval": 9}, SAC).callback["update_interval"] == 9
+
+
+def test_a_search_shares_no_more_out_than_a_network_starts_with():
+    sizes = {"actor": 100, "critic": 300}  # of 400, 200 stay at the end
+
+    def bounds(method):
+        found = wide_space(method, sizes, 0.5).distributions["actor_share"]
+        return found.low, found.high
+
+    # GraNet starts at 0.25, i.e. with 75 and 225; the end is the actor's share of 200.
+    assert bounds("granet") == pytest.approx((0.05, 0.375), abs=2e-4)
+    assert bounds("actor=granet") == pytest.approx((0.05, 0.375), abs=2e-4)
+    for method in ("critic=granet", "rigl", "prune"):
+        assert bounds(method) == pytest.approx((0.05, 0.5), abs=2e-4)
+    # Of 300 and 100, 200 stay, and critics that start at 0.25 have 75 at most: 0.625 or more.
+    sizes = {"actor": 300, "critic": 100}
+    assert "actor_share" not in wide_space("critic=granet", sizes, 0.5).distributions
+
+
+def test_an_entry_given_for_a_preset_is_of_its_kind():
+    other = pendulum(method="set").config_entry()
+    for preset in ("rlx2", "mst", "simba"):
+        with pytest.raises(
+            ConfigError, match=f"with method 'set', which is not the preset '{preset}'"
+        ):
+            pendulum(method=preset, entry=other).settings()
+    rlx2 = pendulum(method="rlx2").config_entry()
+    with pytest.raises(ConfigError, match="'rigl' and the callbacks RobustValueCallback, which is"):
+        pendulum(method="mst", entry=rlx2).settings()
+    assert pendulum(method="rlx2", entry=rlx2).settings().method == "rigl"
+
+
 def test_a_file_of_ones_own_may_name_methods_by_network(tmp_path):
     entry = read_yaml(config_path("mst", "sac"))["Pendulum-v1"]
     path = tmp_path / "mine.yml"
     path.write_text(yaml.safe_dump({"Pendulum-v1": entry}))
-    for method in (None, MST):
+    for method in (None, MST, {"critic": "rigl"}):
         settings = pendulum(conf_file=str(path), method=method).settings()
         assert settings.method == LABEL
         assert settings == pendulum(method="mst").settings()
-    for method in ("mst", "rigl", {"critic": "rigl"}):
+    for method in ("mst", "rigl", {"critic": "set"}):
         with pytest.raises(ConfigError, match=f"trains with method '{LABEL}', not"):
             pendulum(conf_file=str(path), method=method).settings()
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import signal
+from itertools import product
 
 import numpy as np
 import pytest
+from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_sparse.buffers import DynamicReplayBuffer
@@ -15,6 +17,7 @@ from sb3_sparse.tuning import Space
 from sb3_sparse.tuning.backend import optuna
 from sb3_sparse.tuning.spaces import check_space
 from sb3_sparse.zoo import RunFolder, RunSpec, resume, train
+from sb3_sparse.zoo.settings import Settings
 
 SMALL = {
     "learning_starts": 30,
@@ -71,13 +74,30 @@ def test_a_search_varies_its_arguments():
     check_space(space, run)
 
 
-@pytest.mark.parametrize("scale", ["smoke", "small", "medium", "paper"])
-def test_the_arms_of_the_study_differ_in_what_they_name_alone(scale):
+def test_an_argument_is_overridden_wherever_the_callback_is_named():
+    callbacks = ["sb3_sparse.ResetCallback", "sb3_sparse.callbacks.RobustValueCallback"]
+    settings = Settings({"policy": "SparsePolicy", "callback": callbacks, "policy_kwargs": {}})
+    assert settings.changed({"multi_step": 5}, SAC)["callback"] == [
+        callbacks[0],
+        {callbacks[1]: {"multi_step": 5}},
+    ]
+    mine = Settings({"policy": "SparsePolicy", "callback": "my.sb3_sparse.RobustValueCallback"})
+    assert mine.robust_value is None
+
+
+@pytest.mark.parametrize(
+    ("scale", "algo"),
+    [
+        *product(["smoke", "small", "medium", "paper"], ["sac"]),
+        *product(["medium", "paper"], ["td3"]),
+    ],
+)
+def test_the_arms_of_the_study_differ_in_what_they_name_alone(scale, algo):
     study = Study.read("robust_value", scale)
     by_name = {}
     for cell in study.cells:
         run = cell.run
-        same = run.seed == 0 and run.algo == "sac" and run.env_id == study.cells[0].run.env_id
+        same = run.seed == 0 and run.algo == algo and run.env_id == study.cells[0].run.env_id
         if same and 0.9 in (run.sparsity, run.match_params, 0.9 if run.method == "dense" else 0):
             threshold = run.hyperparams.get("distance_threshold")
             by_name[run.method, run.match_params, threshold] = run.settings()

@@ -126,6 +126,8 @@ GOOD = [
 ]
 ENVS = {"dqn": "CartPole-v1", "qrdqn": "CartPole-v1"}
 
+REDO = "sb3_sparse.RecycleDormantCallback"
+
 
 def made(algo, **more):
     return RunSpec(algo=algo, env_id=ENVS.get(algo, "Pendulum-v1"), **more)
@@ -218,6 +220,22 @@ def test_the_same_table_serves_files_options_studies_and_spaces(tmp_path):
         (
             {"callback": {"sb3_sparse.SparsityCallback": {"method": "set", "update_intervall": 5}}},
             "has no argument 'update_intervall' .did you mean 'update_interval'",
+        ),
+        (
+            {"callback": {"sb3_sparse.callbacks.RobustValueCallback": {"multi_stp": 3}}},
+            "RobustValueCallback has no argument 'multi_stp' .did you mean 'multi_step'",
+        ),
+        (
+            {"callback": [REDO, {"sb3_sparse.ResetCallback": {"intervall": 3}}]},
+            "sb3_sparse.ResetCallback has no argument 'intervall' .did you mean 'interval'",
+        ),
+        (
+            {"callback": {REDO: {"tau": -1}}},
+            "tau must be a number, 0 or more, got -1",
+        ),
+        (
+            {"callback": {"sb3_sparse.ResetCallback": 3}},
+            "sb3_sparse.ResetCallback takes a mapping of arguments",
         ),
         ({"callback": [3]}, "a callback is a dotted path, e.g. .*got 3"),
         (
