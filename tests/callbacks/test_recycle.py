@@ -9,11 +9,14 @@ import pytest
 import sb3_contrib
 import stable_baselines3
 import torch as th
+from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
+from stable_baselines3.common.vec_env import VecNormalize
 from support import TinyDicts, TinyImages, assert_masked, make
 
 import sb3_sparse
 from sb3_sparse import RecycleDormantCallback, SparsityCallback
+from sb3_sparse.analysis.activity import activity
 from sb3_sparse.analysis.wiring import wiring_of
 from sb3_sparse.callbacks.recycle import recycle
 from sb3_sparse.errors import ConfigError
@@ -226,6 +229,30 @@ def test_outputs_are_no_units():
     wiring = wiring_of(model.policy, model.get_env().reset())
     assert "actor.mu.4" not in {one.incoming for one in wiring.values()}  # before the tanh
     assert len(wiring) == 6
+
+
+@pytest.mark.parametrize("n_steps", [1, 3])
+def test_batches_are_normalised_observations_of_the_replay_buffer(n_steps, monkeypatch):
+    env = VecNormalize(make_vec_env("Pendulum-v1", 2))
+    model = make("SAC", env, learning_starts=10, n_steps=n_steps)
+    seen = []
+
+    def watched(model, observations, actions):
+        seen.append(observations.numpy())
+        return activity(model, observations, actions)
+
+    monkeypatch.setattr("sb3_sparse.callbacks.recycle.activity", watched)
+    callback = RecycleDormantCallback(1000, batch_size=64)
+    model.learn(60, callback=callback)
+    assert not seen
+    callback.act(1000)
+    stored = model.replay_buffer.observations[:30].reshape(60, 3)
+    allowed = env.normalize_obs(stored)
+    (batch,) = seen
+    assert batch.shape == (64, 3)
+    apart = np.abs(batch[:, None] - allowed).max(axis=2)
+    assert apart.min(axis=1).max() < 1e-6
+    assert np.abs(batch[:, None] - stored).max(axis=2).min() > 1e-3  # none as it is stored
 
 
 def test_other_policies_and_values_are_refused():

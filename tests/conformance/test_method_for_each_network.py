@@ -80,28 +80,82 @@ def test_a_static_actor_keeps_its_mask_and_the_critic_moves_as_beside_a_moving_o
     np.testing.assert_array_equal(masks_of(mixed)["critic"], masks_of(both)["critic"])
 
 
+class Progress(SparsityCallback):
+    """Notes the progress of training at each gradient step of each network."""
+
+    def _on_training_start(self):
+        super()._on_training_start()
+        self.at = {"actor": [], "critic": []}
+
+    def _on_rollout_start(self):
+        self._note_steps()
+        super()._on_rollout_start()
+
+    def _on_training_end(self):
+        self._note_steps()
+        super()._on_training_end()
+
+    def _note_steps(self):
+        for network in networks_of(self.model):
+            at = self.at[network.name]
+            at += [self.model.num_timesteps / STEPS] * (network.clock - len(at))
+
+
 @pytest.mark.parametrize("name", TWO)
 def test_options_of_a_network_are_its_own(name):
-    steps = clocks(name, "masked")
-    model = trained(
-        name,
-        "masked",
+    callback = Progress(
         {"actor": "set", "critic": "rigl"},
         update_interval={"actor": 3, "critic": 4},
         drop_fraction={"actor": 0.4},
-        end=1.0,
+        end={"actor": 1.0, "critic": 0.7},
     )
+    model = make(name, policy_kwargs={"compute": "masked", "sparsity": 0.7})
+    model.learn(STEPS, callback=callback)
     actor, critic = networks_of(model)
-    assert (actor.clock, critic.clock) == (steps["actor"], steps["critic"])
-    # The last environment step, or the last rollout, comes at progress 1, where nothing moves.
-    at_end = {"PPO": 20, "A2C": 1, "TRPO": 20}.get(name, 1)
-    for network, interval in ((actor, 3), (critic, 4)):
-        due = [step for step in range(interval, network.clock + 1, interval)]
-        assert network.updates_due in (
-            len(due),
-            sum(step <= network.clock - at_end for step in due),
-        )
-        assert network.mask_updates > 0
+    for network, interval, end in ((actor, 3, 1.0), (critic, 4, 0.7)):
+        at = callback.at[network.name]
+        assert len(at) == network.clock
+        due = sum(progress < end for progress in at[interval - 1 :: interval])
+        assert (network.updates_due, network.mask_updates > 0) == (due, due > 0)
+
+
+class Rollouts(SparsityCallback):
+    """Keeps the masks before and after what happens when rollouts begin."""
+
+    def _on_training_start(self):
+        super()._on_training_start()
+        self.before, self.after = [], []
+
+    def _on_rollout_start(self):
+        self.before.append(masks_of(self.model))
+        super()._on_rollout_start()
+        self.after.append(masks_of(self.model))
+
+
+@pytest.mark.parametrize("storage", STORAGES)
+@pytest.mark.parametrize("waits", ["actor", "critic"])
+def test_networks_update_at_the_step_or_at_the_rollout_each_for_itself(waits, storage):
+    moves = {"actor": "critic", "critic": "actor"}[waits]
+    callback = Rollouts(
+        {"actor": "rigl", "critic": "granet"},
+        update_interval=4,
+        update_on={waits: "rollout"},
+        end=0.9,
+    )
+    kwargs = {"compute": storage, "sparsity": 0.7, "initial_sparsity": {"critic": 0.35}}
+    model = make("PPO", policy_kwargs=kwargs)
+    model.learn(STEPS, callback=callback)
+    assert_masked(model)
+    starts = list(zip(callback.after, callback.before[1:], callback.after[1:], strict=False))
+    assert len(starts) == 2  # the rollouts after the first
+    for last, before, after in starts:
+        np.testing.assert_array_equal(before[waits], last[waits])  # not in gradient steps
+        assert (after[waits] != before[waits]).any()
+        assert (before[moves] != last[moves]).any()
+        np.testing.assert_array_equal(after[moves], before[moves])
+    for network in networks_of(model):
+        for layer in network.layers:
+            assert layer.nnz == layer.final_nnz, layer.name
 
 
 @pytest.mark.parametrize("storage", STORAGES)

@@ -148,6 +148,8 @@ def test_a_resumed_run_makes_the_moves_of_an_uninterrupted_one(name, method, tmp
         start = {network: STARTS[one] for network, one in method.items() if one in STARTS}
     model = make(name, policy_kwargs=dict(initial_sparsity=start))
     options = dict(update_interval=4, begin=0.0)
+    if isinstance(method, dict):
+        options["update_on"] = {"critic": "rollout"}
     model.learn(64, callback=SparsityCallback(method, **options))
     model.save(tmp_path / "model")
     resumed = ALGORITHMS[name].load(tmp_path / "model", env=model.env, device="cpu")
@@ -169,6 +171,7 @@ def test_a_resumed_run_makes_the_moves_of_an_uninterrupted_one(name, method, tmp
                 each.train()
             else:
                 each.train(gradient_steps=4, batch_size=16)
+            sparse.flush()
         sparse.stop()
     assert model.policy.sparse.networks[-1].mask_updates > 0
     assert_same(state_of(model), state_of(resumed))
