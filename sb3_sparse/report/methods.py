@@ -40,7 +40,6 @@ LOOKS = {
     "granet": Look("#117733", "^", "-."),
     "mst": Look("#882255", "v", "--"),
     "rlx2": Look("#44AA99", "P", (0, (3, 1, 1, 1))),
-    "simba": Look("#999933", "h", (0, (5, 1))),
 }
 OTHERS = (Look("#009E73", "^", "-"), Look("#56B4E9", "v", "--"), Look("#7F7F7F", "P", ":"))
 # For levels of sparsity, budgets and regimes, from much to little; distinct in grey, too.
