@@ -34,8 +34,9 @@ def test_a_case_is_a_line_for_each_way(fused_steps, monkeypatch, capsys):
     milliseconds = [float(row[3]) for row in cells]
     for row, took in zip(cells, milliseconds, strict=True):
         assert took > 0
-        assert float(row[4]) == pytest.approx(took / milliseconds[0], rel=0.01)
-        assert float(row[5]) == pytest.approx(took / milliseconds[1], rel=0.01)
+        # All numbers are rounded to three digits behind the point, of which small ones have few.
+        assert float(row[4]) == pytest.approx(took / milliseconds[0], rel=0.1)
+        assert float(row[5]) == pytest.approx(took / milliseconds[1], rel=0.1)
 
 
 def test_steps_that_are_not_fused_are_not_called_so(fused_steps, monkeypatch):
