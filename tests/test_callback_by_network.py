@@ -169,3 +169,8 @@ def test_granet_ends_exact_even_if_no_gradient_comes_after_the_end():
     model = learn(SparsityCallback("granet", update_interval=10**6, end=1.0), initial_sparsity=0.45)
     for layer in model.policy.sparse.layers:
         assert layer.nnz == layer.final_nnz
+
+
+def test_an_option_of_a_network_without_a_method_is_named_so():
+    with pytest.raises(ConfigError, match="'critc' is not among 'actor', 'critic', so its method"):
+        SparsityCallback({"actor": "static", "critic": "rigl"}, update_interval={"critc": 5})

@@ -8,7 +8,7 @@ from typing import ClassVar
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_sparse.errors import ConfigError
+from sb3_sparse.errors import ConfigError, warn
 from sb3_sparse.policies.internals import updates_done
 from sb3_sparse.sparsity.numeric import is_whole
 
@@ -54,7 +54,8 @@ class IntervalCallback(BaseCallback):
             )
 
     def _on_training_start(self) -> None:
-        self._sees_rollouts = False
+        self._sees_rollouts = self._acted = False
+        self._began = updates_done(self.model)
         done = updates_done(self.model)  # so nothing is due of steps without the callback
         self._note(done if self.acts_at_end else getattr(self.model, ACTED_UP_TO, done))
 
@@ -74,12 +75,19 @@ class IntervalCallback(BaseCallback):
     def _on_training_end(self) -> None:
         if self.acts_at_end:
             self._act_if_due()
+        steps = updates_done(self.model) - self._began
+        if steps < self.interval and not self._acted:
+            warn(
+                f"{type(self).__name__}: this training of {steps} gradient steps reached no "
+                f"multiple of {self.interval}, the interval; train longer, or choose a smaller one"
+            )
 
     def _act_if_due(self) -> None:
         done = updates_done(self.model)
         due = done // self.interval > self._done // self.interval
         self._note(done)
         if due:
+            self._acted = True
             self.act(done)
 
     def _note(self, steps: int) -> None:

@@ -11,6 +11,7 @@ import torch as th
 from torch import nn
 
 from sb3_sparse.engine.residual import Residual
+from sb3_sparse.errors import ConfigError
 from sb3_sparse.networks.simba import initialise, simba
 from sb3_sparse.policies.base import BaseSparsePolicy
 from sb3_sparse.policies.critics import SparseContinuousCritic, SparseCritic
@@ -83,6 +84,7 @@ class SimbaPolicy(BaseSparsePolicy):
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         if kwargs.get("net_arch") is None:
             kwargs["net_arch"] = deepcopy(self.default_arch)
+        self._check_arch(kwargs["net_arch"])
         if "optimizer_class" not in kwargs:
             usual = dict(self.default_optimizer_kwargs)
             if kwargs.get("weight_decay"):
@@ -90,6 +92,19 @@ class SimbaPolicy(BaseSparsePolicy):
             kwargs["optimizer_class"] = th.optim.AdamW
             kwargs["optimizer_kwargs"] = {**usual, **(kwargs.get("optimizer_kwargs") or {})}
         super().__init__(*args, **kwargs)
+
+    def _check_arch(self, net_arch: Any) -> None:
+        """Reject what SB3 would read as a network without layers, or fail at."""
+        by_network = isinstance(self.default_arch, Mapping)
+        named = (
+            isinstance(net_arch, Mapping) and by_network and net_arch.keys() == {*self.default_arch}
+        )
+        if not isinstance(net_arch, list) and not named:
+            also = f", or a mapping such as {self.default_arch}" if by_network else ""
+            raise ConfigError(
+                "net_arch of a SimBa network is a list with an entry for each block, e.g. "
+                f"[256, 256]{also}; got {net_arch!r}"
+            )
 
     def _initial_gain(self, layer_name: str) -> float:
         """The gain relative to Glorot that gives a dense layer the variance of SimBa's weights."""

@@ -53,7 +53,8 @@ class Definition:
         """The search's name if the user gives none."""
         sparsity = self.run.settings().policy_kwargs["sparsity"]
         shares = sparsity.values() if isinstance(sparsity, Mapping) else [sparsity]
-        parts = [self.run.algo, env_name(self.run.env_id), self.method]
+        method = self.method.replace(", ", "-").replace("=", "-")
+        parts = [self.run.algo, env_name(self.run.env_id), method]
         searched = "sparsity" in one_of_each(self.space)
         if self.method != "dense" and not searched:
             parts += [f"{share:g}" for share in shares]

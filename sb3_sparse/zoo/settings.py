@@ -168,9 +168,19 @@ class Settings(Mapping[str, Any]):
         methods = self.methods
         if methods is not None:
             return methods.label
+        return DENSE if self.is_dense else "static"
+
+    @property
+    def is_dense(self) -> bool:
+        """Whether every network is dense, and stays so.
+
+        :raises ConfigError: as :attr:`callback`, and for an unknown method
+        """
+        methods = self.methods
         sparsity = self.policy_kwargs.get("sparsity")
         shares = list(sparsity.values()) if isinstance(sparsity, Mapping) else [sparsity]
-        return DENSE if all(share == 0.0 for share in shares) else "static"
+        still = methods is None or not methods.options
+        return still and all(share == 0.0 for share in shares)
 
     @property
     def kind(self) -> tuple[str, str, tuple[str, ...]]:

@@ -190,8 +190,10 @@ class RunSpec:
 
         :param settings: the run's settings
         """
-        preset = self.preset
-        return preset if preset and settings.callback is not None else settings.method
+        if settings.is_dense:
+            return DENSE
+        moves = settings.methods is not None and settings.methods.options
+        return self.preset if self.preset and moves else settings.method
 
     def config_entry(self) -> dict[str, Any]:
         """Return a copy of the config's entry for the environment.
@@ -225,11 +227,6 @@ class RunSpec:
                 "dense training has no sparsity; leave --sparsity out, or give --match-params "
                 f"{self.sparsity} for the dense network of equal parameter count"
             )
-        if method != DENSE and self.match_params is not None:
-            raise ConfigError(
-                f"--match-params is for --method dense, not {method!r}: it trains the dense "
-                "network that has as many parameters as the sparse one"
-            )
         from sb3_sparse.zoo.validation import check_settings
 
         wanted = {
@@ -238,6 +235,12 @@ class RunSpec:
             if getattr(self, name) is not None
         }
         settings = settings.changed({**self.hyperparams, **wanted}, self.algorithm)
+        if self.match_params is not None and not settings.is_dense:
+            add = f"--method {self.preset} --sparsity 0" if self.preset else "--method dense"
+            raise ConfigError(
+                f"--match-params trains the dense network that has as many parameters as the "
+                f"sparse one, and {method!r} is not dense; give {add}"
+            )
         check_settings(settings, self.algorithm)
         if settings.method != method:
             raise ConfigError(

@@ -272,3 +272,9 @@ def test_other_policies_and_values_are_refused():
 
 def test_contrib_is_there():
     assert set(OFF_POLICY) <= {*dir(stable_baselines3), *dir(sb3_contrib)}
+
+
+def test_a_training_shorter_than_the_interval_is_told_so():
+    model = make("SAC", learning_starts=10)
+    with pytest.warns(UserWarning, match="reached no multiple of 1000, the interval"):
+        model.learn(30, callback=RecycleDormantCallback())

@@ -18,7 +18,7 @@ from support import ALGORITHMS, DISCRETE, TinyDicts, TinyImages, assert_masked, 
 from torch import nn
 
 import sb3_sparse
-from sb3_sparse import SparsityCallback
+from sb3_sparse import RecycleDormantCallback, ResetCallback, SparsityCallback
 from sb3_sparse.engine.inference import Inference
 from sb3_sparse.engine.residual import Residual
 from sb3_sparse.errors import ConfigError
@@ -341,6 +341,35 @@ def test_no_blocks_or_several_widths(name):
     for arch in ([], [8, 16]):
         with pytest.raises(ConfigError, match="one entry for each of its blocks"):
             simba(name, policy_kwargs=dict(net_arch=arch))
+
+
+@pytest.mark.parametrize("compute", STORAGES)
+@pytest.mark.parametrize("name", ["SAC", "TD3", "DQN", "TQC"])
+def test_recycled_units_and_resets(name, compute):
+    callbacks = [
+        SparsityCallback("rigl", update_interval=4),
+        RecycleDormantCallback(5, tau=0.8, batch_size=32),
+        ResetCallback(20),
+    ]
+    model = simba(name, compute=compute).learn(60, callback=callbacks)
+    assert_masked(model)
+    assert all(th.isfinite(parameter).all() for parameter in model.policy.parameters())
+    assert model.resets_up_to >= 20
+
+
+@pytest.mark.parametrize(
+    ("name", "arch"),
+    [
+        ("PPO", {"pi": [8], "qf": [8]}),
+        ("SAC", {"pi": [8], "vf": [8]}),
+        ("SAC", {"pi": [8]}),
+        ("DQN", {"qf": [8]}),
+        ("TD3", 128),
+    ],
+)
+def test_forms_of_net_arch_that_do_not_fit(name, arch):
+    with pytest.raises(ConfigError, match=r"list with an entry for each block.*; got"):
+        simba(name, policy_kwargs=dict(net_arch=arch))
 
 
 def test_stock_algorithms_take_it_by_name():

@@ -384,3 +384,16 @@ def test_rlx2_is_as_in_its_paper(algo, version):
                               "learning_starts": 25_000, "learning_rate": 3e-4,
                               "batch_size": 256})  # fmt: skip
         assert run.preset == "rlx2"
+
+
+def test_a_preset_at_sparsity_0_is_dense_and_may_be_as_small_as_a_sparse_one():
+    sparse, dense = (RunSpec("sac", "Pendulum-v1", method="simba", sparsity=s) for s in (0.8, 0.0))
+    assert [run.name_of(run.settings()) for run in (sparse, dense)] == ["static", "dense"]
+    matched = RunSpec("sac", "Pendulum-v1", method="simba", sparsity=0.0, match_params=0.8)
+    assert matched.settings().is_dense
+    with pytest.raises(ConfigError, match="give --method simba --sparsity 0"):
+        RunSpec("sac", "Pendulum-v1", method="simba", match_params=0.8).settings()
+    assert RunSpec("sac", "Hopper-v5", method="mst").preset == "mst"
+    for preset in ("mst", "rlx2"):
+        run = RunSpec("sac", "Hopper-v5", method=preset)
+        assert run.name_of(run.settings()) == preset
