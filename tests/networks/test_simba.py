@@ -4,31 +4,11 @@ from __future__ import annotations
 
 import pytest
 import torch as th
+from simba_support import simba_by_hand
 from torch import nn
 
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.networks import SimbaBlock, simba
-
-
-def by_hand(network: nn.Sequential, x: th.Tensor) -> th.Tensor:
-    """The formulas of arXiv:2410.09754, from the weights by their names."""
-    weights = dict(network.named_parameters())
-
-    def linear(name, x):
-        return x @ weights[f"{name}.weight"].T + weights[f"{name}.bias"]
-
-    def norm(name, x):
-        centred = x - x.mean(-1, keepdim=True)
-        scaled = centred / (centred.square().mean(-1, keepdim=True) + 1e-6).sqrt()
-        return scaled * weights[f"{name}.weight"] + weights[f"{name}.bias"]
-
-    h = linear("0", x)
-    blocks = len(network) - 2
-    for number in range(1, blocks + 1):
-        name = f"{number}.residual"
-        inner = linear(f"{name}.1", norm(f"{name}.0", h)).clamp(min=0)
-        h = h + linear(f"{name}.3", inner)
-    return norm(f"{blocks + 1}", h)
 
 
 @pytest.mark.parametrize("blocks", [1, 3])
@@ -38,7 +18,7 @@ def test_outputs_and_gradients_are_those_of_the_formulas(blocks):
     for parameter in network.parameters():
         parameter.data.add_(0.1 * th.randn_like(parameter))
     found = []
-    for compute in (network, lambda x: by_hand(network, x)):
+    for compute in (network, lambda x: simba_by_hand(dict(network.named_parameters()), blocks, x)):
         x = th.linspace(-2, 2, 35, dtype=th.float64).view(7, 5).requires_grad_()
         y = compute(x)
         network.zero_grad()

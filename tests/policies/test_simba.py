@@ -14,6 +14,7 @@ import torch as th
 from algorithms_support import NAMES as FUSED
 from algorithms_support import assert_alike, assert_like_stock, learn, moving, policy_kwargs_of
 from algorithms_support import make as make_alike
+from simba_support import simba_by_hand
 from support import ALGORITHMS, DISCRETE, TinyDicts, TinyImages, assert_masked, make
 from torch import nn
 
@@ -171,24 +172,6 @@ def test_what_the_kernels_leave_to_the_modules(net):
     assert Inference.of([[net]]) is None
 
 
-def values_by_hand(policy, x):
-    """What SAC's first critic gives, from its saved weights."""
-    weights = {k.removeprefix("critic.qf0."): v for k, v in policy.state_dict().items()}
-
-    def linear(name, x):
-        return x @ weights[f"{name}.weight"].T + weights[f"{name}.bias"]
-
-    def norm(name, x):
-        centred = x - x.mean(-1, keepdim=True)
-        scaled = centred / (centred.square().mean(-1, keepdim=True) + 1e-6).sqrt()
-        return scaled * weights[f"{name}.weight"] + weights[f"{name}.bias"]
-
-    h = linear("0", x)
-    for block in ("1.residual", "2.residual"):
-        h = h + linear(f"{block}.3", linear(f"{block}.1", norm(f"{block}.0", h)).clamp(min=0))
-    return linear("4", norm("3", h))
-
-
 @pytest.mark.parametrize(
     ("sparsity", "compute"), [(0.0, "masked"), (0.8, "masked"), (0.8, "sparse")]
 )
@@ -196,7 +179,9 @@ def test_a_critic_is_the_network_of_the_paper(sparsity, compute):
     model = simba("SAC", compute=compute, policy_kwargs=dict(sparsity=sparsity)).learn(40)
     obs, actions = th.randn(70, 3), th.rand(70, 1)
     x = th.cat([obs, actions], dim=1).requires_grad_()
-    expected = values_by_hand(model.policy, x)
+    saved = model.policy.state_dict().items()
+    weights = {k.removeprefix("critic.qf0."): v for k, v in saved if k.startswith("critic.qf0.")}
+    expected = simba_by_hand(weights, 2, x)
     (slope,) = th.autograd.grad(expected.sum(), x)
     found = model.critic(obs, actions.requires_grad_())[0]
     th.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
