@@ -235,12 +235,6 @@ class RunSpec:
             if getattr(self, name) is not None
         }
         settings = settings.changed({**self.hyperparams, **wanted}, self.algorithm)
-        if self.match_params is not None and not settings.is_dense:
-            add = f"--method {self.preset} --sparsity 0" if self.preset else "--method dense"
-            raise ConfigError(
-                f"--match-params trains the dense network that has as many parameters as the "
-                f"sparse one, and {method!r} is not dense; give {add}"
-            )
         check_settings(settings, self.algorithm)
         if settings.method != method:
             raise ConfigError(
@@ -251,6 +245,12 @@ class RunSpec:
             raise ConfigError(
                 f"the settings of {self.env_id} in {self.config} lack n_timesteps; add it there or "
                 "give -n"
+            )
+        if self.match_params is not None and not settings.is_dense:
+            add = f"--method {self.preset} --sparsity 0" if self.preset else "--method dense"
+            raise ConfigError(
+                f"--match-params trains the dense network that has as many parameters as the "
+                f"sparse one, and {method!r} is not dense; give {add}"
             )
         return settings.replaced(n_timesteps=int(settings["n_timesteps"]))
 

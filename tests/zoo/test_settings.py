@@ -205,7 +205,7 @@ def test_what_the_user_wants_wins_over_the_config():
         (dict(n_timesteps=0), "n_timesteps must be 1 or more"),
         (dict(eval_freq=-5), "eval_freq must be 1 or more"),
         (dict(method="dense", sparsity=0.9), "--match-params 0.9"),
-        (dict(method="rigl", match_params=0.9), "for --method dense, not 'rigl'"),
+        (dict(method="rigl", match_params=0.9), "'rigl' is not dense; give --method dense"),
         (dict(method="dense", match_params=1.5), "match_params"),
     ],
 )
