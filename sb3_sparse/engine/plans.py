@@ -49,7 +49,8 @@ class Plans:
             own = {name: v[network] for name, v in by_network.items() if network in v}
             where = f"method {methods[network].name!r} of {network!r}"
             if methods.named and network not in methods.named and not methods[network].options:
-                where = f"{network!r} is not among {', '.join(map(repr, methods.named))}, so its {where}"
+                known = ", ".join(map(repr, methods.named))
+                where = f"{network!r} is not among {known}, so its {where}"
             _check_options(where, set(own), methods[network].options)
             try:
                 named[network] = _plan(methods, network, {**defaults, **for_all, **own})
