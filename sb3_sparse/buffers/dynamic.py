@@ -55,6 +55,10 @@ class DynamicReplayBuffer(NStepReplayBuffer):
 
     action_means: NDArray[np.float32]
     """Action means, in units of the bound, shape ``(rows, environments, dim)``."""
+    forgotten: int
+    """Rows that ``shrink`` has forgotten and nothing has overwritten since; the oldest."""
+    without_means: int
+    """Rows whose action means have not been stored yet; the newest."""
 
     def __init__(self, *args: Any, n_steps: int = 1, gamma: float = 0.99, **kwargs: Any) -> None:
         super().__init__(*args, n_steps=n_steps, gamma=gamma, **kwargs)
@@ -83,11 +87,6 @@ class DynamicReplayBuffer(NStepReplayBuffer):
         self.action_means = np.zeros(shape, dtype=np.float32)
         self.forgotten = 0
         self.without_means = stored
-
-    forgotten: int
-    """Rows that ``shrink`` has forgotten and nothing has overwritten since; the oldest."""
-    without_means: int
-    """Rows whose action means have not been stored yet; the newest."""
 
     def size(self) -> int:
         """Rows in use."""

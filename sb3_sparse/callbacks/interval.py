@@ -54,9 +54,9 @@ class IntervalCallback(BaseCallback):
             )
 
     def _on_training_start(self) -> None:
-        self._sees_rollouts = self._acted = False
-        self._began = updates_done(self.model)
-        done = updates_done(self.model)  # so nothing is due of steps without the callback
+        self._sees_rollouts = False
+        self._began = done = updates_done(self.model)
+        # Nothing is due of steps that were trained without the callback.
         self._note(done if self.acts_at_end else getattr(self.model, ACTED_UP_TO, done))
 
     def _on_rollout_start(self) -> None:
@@ -75,10 +75,10 @@ class IntervalCallback(BaseCallback):
     def _on_training_end(self) -> None:
         if self.acts_at_end:
             self._act_if_due()
-        steps = updates_done(self.model) - self._began
-        if steps < self.interval and not self._acted:
+        began, done = self._began, updates_done(self.model)
+        if done // self.interval == began // self.interval:
             warn(
-                f"{type(self).__name__}: this training of {steps} gradient steps reached no "
+                f"{type(self).__name__}: this training of {done - began} gradient steps reached no "
                 f"multiple of {self.interval}, the interval; train longer, or choose a smaller one"
             )
 
@@ -87,7 +87,6 @@ class IntervalCallback(BaseCallback):
         due = done // self.interval > self._done // self.interval
         self._note(done)
         if due:
-            self._acted = True
             self.act(done)
 
     def _note(self, steps: int) -> None:

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.text import Text
 
 from sb3_sparse.errors import ConfigError
-from sb3_sparse.zoo.settings import parse_overrides
+from sb3_sparse.zoo.overrides import parse_overrides
 from sb3_sparse.zoo.spec import RunSpec
 
 console = Console(highlight=False, markup=False)

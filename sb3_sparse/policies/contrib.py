@@ -23,6 +23,7 @@ from sb3_sparse.policies.registry import (
     register_policy,
     register_variant,
     reject,
+    reject_variant,
     variants_of,
 )
 from sb3_sparse.policies.sac import GAUSSIAN_ACTING, GAUSSIAN_ACTOR, TWIN_CRITIC, sac_passes
@@ -244,6 +245,7 @@ class SparseCrossQPolicy(SparseCriticsMixin, CrossQPolicy):
 
 
 (SparseCrossQMlpPolicy,) = variants_of(SparseCrossQPolicy, "Mlp")
+reject_variant(CrossQ, "Simba")  # it normalises its layers over the batch
 
 
 register_policy(TRPO, own_attribute="cg_max_steps")(SparseActorCriticPolicy)

@@ -177,6 +177,15 @@ def reject(algorithm: type[BaseAlgorithm]) -> None:
     _rejected.append(algorithm)
 
 
+def reject_variant(algorithm: type[BaseAlgorithm], prefix: str) -> None:
+    """Let ``"Sparse<prefix>Policy"`` raise an error in an algorithm that has no such policy."""
+
+    def no_policy(*args: Any, **kwargs: Any) -> Any:
+        raise UnsupportedError(_absence(algorithm, f"Sparse{prefix}Policy"))
+
+    _add_aliases(algorithm, {prefix: no_policy})
+
+
 def _address(cls: type) -> str:
     """Where a class is defined; the same when its cell or module is run again."""
     return f"{cls.__module__}.{cls.__qualname__}"
@@ -209,11 +218,18 @@ def policy_named(algorithm: type[BaseAlgorithm], alias: str) -> type[BaseSparseP
     :raises ConfigError: naming the algorithms that have it, if this one does not
     """
     policy: Any = algorithm.policy_aliases.get(alias)
-    if policy is None:
-        able = [name for name, one in supported_algorithms().items() if alias in one.policy_aliases]
-        raise ConfigError(f"{algorithm.__name__} has no {alias}; it is there for {', '.join(able)}")
-    found: type[BaseSparsePolicy] = policy
-    return found
+    if not isinstance(policy, type):
+        raise ConfigError(_absence(algorithm, alias))
+    return policy
+
+
+def _absence(algorithm: type[BaseAlgorithm], alias: str) -> str:
+    able = (
+        name
+        for name, one in supported_algorithms().items()
+        if isinstance(one.policy_aliases.get(alias), type)
+    )
+    return f"{algorithm.__name__} has no {alias}; it is there for {', '.join(able)}"
 
 
 def lineage(algo: str) -> list[str]:

@@ -32,7 +32,7 @@ from sb3_sparse.studies.measures import Measures
 from sb3_sparse.topology import method_named, method_names
 from sb3_sparse.zoo.configs import read_yaml
 from sb3_sparse.zoo.environments import package_names
-from sb3_sparse.zoo.settings import Names
+from sb3_sparse.zoo.names import Names
 from sb3_sparse.zoo.spec import RunSpec
 
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from sb3_sparse.sparsity.distributions import floor_count
-from sb3_sparse.sparsity.schedules import cosine_drop_fraction, pruned_count
+from sb3_sparse.sparsity.schedules import cosine_drop_fraction
 from sb3_sparse.topology.base import Layer, MaskUpdate
+from sb3_sparse.topology.prune import allowed
 from sb3_sparse.topology.registry import register
 from sb3_sparse.topology.rigl import RigL
 
@@ -25,15 +26,8 @@ class GraNet(RigL):
     initial_share = 0.5
 
     def counts(self, layer: Layer, update: MaskUpdate) -> tuple[int, int]:
-        ramp = pruned_count(
-            layer.size,
-            layer.initial_nnz,
-            layer.final_nnz,
-            update.progress,
-            update.begin,
-            update.end,
-        )
-        keep = min(ramp, layer.nnz)  # training on, at a lower progress, brings nothing back
+        # A training that goes on, at a lower progress, brings nothing back.
+        keep = min(allowed(layer, update), layer.nnz)
         fraction = cosine_drop_fraction(update.progress, update.drop_fraction, update.end)
         grown = floor_count(fraction * keep)
         return layer.nnz - keep + grown, grown

@@ -24,17 +24,21 @@ class Prune(TopologyMethod):
     reaches_final = True
 
     def exchange(self, layer: Layer, update: MaskUpdate, *, dense_grad: Array | None) -> Exchange:
-        keep = pruned_count(
-            layer.size,
-            layer.initial_nnz,
-            layer.final_nnz,
-            update.progress,
-            update.begin,
-            update.end,
-        )
-        surplus = layer.nnz - keep
+        surplus = layer.nnz - allowed(layer, update)
         if surplus <= 0:
             return NOTHING
         active = np.flatnonzero(layer.mask())
         dropped = least_magnitude(layer.dense(), active, surplus)
         return Exchange(dropped=dropped, grown=np.empty(0, dtype=np.int64))
+
+
+def allowed(layer: Layer, update: MaskUpdate) -> int:
+    """Return how many connections the cubic ramp allows a layer at an update."""
+    return pruned_count(
+        layer.size,
+        layer.initial_nnz,
+        layer.final_nnz,
+        update.progress,
+        update.begin,
+        update.end,
+    )

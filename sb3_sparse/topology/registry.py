@@ -43,6 +43,9 @@ def method_named(name: str) -> TopologyMethod:
 
     :raises ConfigError: if no method has that name
     """
-    own = "a subclass of sb3_sparse.topology.TopologyMethod with @register on it"
-    check_choice("method", name, method_names(), f". A method of your own is {own}")
+    hint = (
+        ". A method of your own is a subclass of sb3_sparse.topology.TopologyMethod with @register "
+        "on it; presets, such as mst, are for --method alone"
+    )
+    check_choice("method", name, method_names(), hint)
     return _METHODS[name]

@@ -2,27 +2,28 @@
 
 from __future__ import annotations
 
-import ast
 import dataclasses
 import inspect
 import json
 from collections.abc import Iterable, Iterator, Mapping
 from copy import deepcopy
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from sb3_sparse.errors import ConfigError, did_you_mean
-from sb3_sparse.policies.arguments import arguments_of, import_path
 from sb3_sparse.policies.registry import SparsePolicy, SparseSimbaPolicy, policy_named
 from sb3_sparse.topology import Methods
 from sb3_sparse.zoo.callbacks import (
-    listed,
+    CALLBACK,
+    is_own,
     named,
     package_callback,
     robust_value_of,
+    sparsity_callback,
     with_robust_value,
 )
 from sb3_sparse.zoo.configs import DENSE
+from sb3_sparse.zoo.names import Names
+from sb3_sparse.zoo.overrides import literal
 
 if TYPE_CHECKING:  # imported when settings are checked, not when names are read
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -31,27 +32,6 @@ if TYPE_CHECKING:  # imported when settings are checked, not when names are read
 
 POLICIES = {f"sb3_sparse.{alias}": alias for alias in (SparsePolicy, SparseSimbaPolicy)}
 """The sparse policies that settings may name, as a dotted path or by the alias."""
-CALLBACK = "sb3_sparse.SparsityCallback"
-ZOO_KEYS = frozenset(
-    {
-        "callback",
-        "env_kwargs",
-        "env_wrapper",
-        "frame_stack",
-        "monitor_kwargs",
-        "n_envs",
-        "n_timesteps",
-        "noise_std",
-        "noise_type",
-        "normalize",
-        "policy",
-        "policy_kwargs",
-        "vec_env_wrapper",
-    }
-)
-"""Keys that rl-zoo itself reads, beside the arguments of the algorithm's constructor."""
-SET_BY_THE_RUN = frozenset({"device", "seed", "tensorboard_log", "verbose"})
-"""Constructor arguments of every algorithm that separate options set."""
 COMPARED = frozenset({"sparsity", "initial_sparsity", "method", "callback", "policy_kwargs"})
 """Names that :meth:`Settings.variant` omits or lists separately."""
 
@@ -130,13 +110,13 @@ class Settings(Mapping[str, Any]):
 
         :raises ConfigError: if a callback has another form, or lacks its method
         """
-        found = _sparsity_callback(self._content, self._imports)
+        found = sparsity_callback(self._content, self._imports)
         return None if found is None else deepcopy(found[1])
 
     @property
     def has_own_callback(self) -> bool:
         """Whether the callback is a user's subclass, which may take other arguments."""
-        found = _sparsity_callback(self._content, self._imports)
+        found = sparsity_callback(self._content, self._imports)
         return found is not None and found[0]
 
     @property
@@ -189,7 +169,7 @@ class Settings(Mapping[str, Any]):
         :raises ConfigError: as :attr:`alias` and :attr:`callback`
         """
         alias, method = self.alias, self.method
-        paths = [path for path, _ in named(self._content) if _is_own(path) is None]
+        paths = [path for path, _ in named(self._content) if is_own(path) is None]
         return alias, method, tuple(sorted(package_callback(path) or path for path in paths))
 
     def changed(self, overrides: Mapping[str, Any], algorithm: type[BaseAlgorithm]) -> Settings:
@@ -211,7 +191,7 @@ class Settings(Mapping[str, Any]):
             elif name in names.policy:
                 content["policy_kwargs"] = {**_policy_kwargs(content), name: value}
             elif name in names.schedule:
-                found = _sparsity_callback(content, self._imports)
+                found = sparsity_callback(content, self._imports)
                 if found is None:
                     raise ConfigError(
                         f"{name} means nothing here: these settings train without {CALLBACK}"
@@ -248,7 +228,7 @@ class Settings(Mapping[str, Any]):
         usually do.
         """
         content = self.as_dict()
-        found = _sparsity_callback(content, self._imports)
+        found = sparsity_callback(content, self._imports)
         if found is None:
             content["callback"] = [{CALLBACK: {}}]
             arguments = content["callback"][0][CALLBACK]
@@ -312,44 +292,6 @@ class Settings(Mapping[str, Any]):
         return json.dumps({**kept(self), **parts}, sort_keys=True, default=str)
 
 
-@dataclass(frozen=True)
-class Names:
-    """The names of the arguments that settings may hold, by owner. They do not overlap.
-
-    :param algorithm: arguments of the algorithm's constructor and of rl-zoo
-    :param policy: arguments of the sparse policy
-    :param schedule: arguments of the SparsityCallback, except its method
-    :param robust_value: arguments of the RobustValueCallback
-    """
-
-    algorithm: frozenset[str]
-    policy: frozenset[str]
-    schedule: frozenset[str]
-    robust_value: frozenset[str]
-
-    @classmethod
-    def of(cls, algorithm: type[BaseAlgorithm], alias: str = SparsePolicy) -> Names:
-        """Return the names that the settings of an algorithm may hold.
-
-        :param alias: the name of the policy
-        :raises ConfigError: if the algorithm has no such policy
-        """
-        from sb3_sparse.callback import SparsityCallback
-        from sb3_sparse.callbacks import RobustValueCallback
-
-        return cls(
-            (arguments_of(algorithm) - SET_BY_THE_RUN) | ZOO_KEYS,
-            arguments_of(policy_named(algorithm, alias)),
-            arguments_of(SparsityCallback) - {"method", "verbose"},
-            arguments_of(RobustValueCallback) - {"verbose"},
-        )
-
-    @property
-    def all(self) -> frozenset[str]:
-        """The names of all owners."""
-        return self.algorithm | self.policy | self.schedule | self.robust_value
-
-
 def _merged(known: Any, value: Any) -> Any:
     """Return a value in the place of a known one; a mapping of a mapping is merged into it."""
     both = isinstance(known, Mapping) and isinstance(value, Mapping)
@@ -360,86 +302,13 @@ def _listed(names: Iterable[str]) -> str:
     return ", ".join(sorted(names))
 
 
-def _sparsity_callback(
-    settings: Mapping[str, Any], imports: bool
-) -> tuple[bool, dict[str, Any]] | None:
-    """Return whether the SparsityCallback is a user's subclass, and its arguments."""
-    for callback in listed(settings):
-        named = callback if isinstance(callback, dict) else {callback: {}}
-        if len(named) != 1:
-            raise ConfigError(
-                f"a callback is one path, with its arguments indented below it, got {callback!r}"
-            )
-        ((path, arguments),) = named.items()
-        has_method = isinstance(arguments, dict) and "method" in arguments
-        own = _is_own(path) if imports or path == CALLBACK else has_method or None
-        if own is not None:
-            if not has_method:
-                raise ConfigError(f"{path} needs a method, e.g. {path}: {{method: rigl}}")
-            return own, arguments
-    return None
-
-
-def _is_own(path: object) -> bool | None:
-    """Return True for a subclass of SparsityCallback, False for itself, None for other paths."""
-    if not isinstance(path, str):
-        raise ConfigError(f"a callback is a dotted path, e.g. {CALLBACK}, got {path!r}")
-    if path == CALLBACK:
-        return False
-    from sb3_sparse.callback import SparsityCallback
-
-    try:
-        found = import_path(path)
-    except ImportError:
-        return None  # rl-zoo reports this when it imports the callback
-    ours = isinstance(found, type) and issubclass(found, SparsityCallback)
-    return found is not SparsityCallback if ours else None
-
-
 def _policy_kwargs(settings: Mapping[str, Any]) -> dict[str, Any]:
     kwargs = settings.get("policy_kwargs", {})
     if isinstance(kwargs, str):
-        kwargs = _value(kwargs)
+        kwargs = literal(kwargs)
     if not isinstance(kwargs, dict):
         raise ConfigError(
             f"policy_kwargs must be a mapping of plain values, got {kwargs!r}; e.g. "
             "{sparsity: 0.9, net_arch: [256, 256], activation_fn: torch.nn.ReLU}"
         )
     return kwargs
-
-
-def parse_overrides(texts: Iterable[str]) -> dict[str, Any]:
-    """Parse ``["learning_rate:0.001", ...]``, the form of rl-zoo's ``--hyperparams``.
-
-    A value is a Python literal or ``dict(...)`` of literals; anything else (``lin_0.001``, a
-    dotted path) is text.
-
-    :raises ConfigError: for a text without a colon
-    """
-    overrides: dict[str, Any] = {}
-    for text in texts:
-        name, colon, value = text.partition(":")
-        if not colon or not name or not value:
-            raise ConfigError(
-                f"hyperparameters are given as name:value, e.g. learning_rate:0.001, got {text!r}"
-            )
-        overrides[name] = _value(value)
-    return overrides
-
-
-class _DictCalls(ast.NodeTransformer):
-    """Turns ``dict(a=1)``, as the zoo's files write it, into ``{"a": 1}``."""
-
-    def visit_Call(self, node: ast.Call) -> ast.AST:
-        self.generic_visit(node)
-        if not (isinstance(node.func, ast.Name) and node.func.id == "dict") or node.args:
-            return node
-        keys: list[ast.expr | None] = [ast.Constant(keyword.arg) for keyword in node.keywords]
-        return ast.Dict(keys=keys, values=[keyword.value for keyword in node.keywords])
-
-
-def _value(text: str) -> Any:
-    try:
-        return ast.literal_eval(_DictCalls().visit(ast.parse(text.strip(), mode="eval")))
-    except (ValueError, SyntaxError):
-        return text

@@ -19,8 +19,9 @@ from sb3_sparse.policies.arguments import arguments_of, import_classes
 from sb3_sparse.policies.config import SPARSITY_MISSING, SparsityConfig
 from sb3_sparse.topology import Methods
 from sb3_sparse.zoo.arguments import kind_of
-from sb3_sparse.zoo.callbacks import ROBUST_VALUE, package_callbacks
-from sb3_sparse.zoo.settings import CALLBACK, SET_BY_THE_RUN, Names, Settings
+from sb3_sparse.zoo.callbacks import CALLBACK, ROBUST_VALUE, package_callbacks
+from sb3_sparse.zoo.names import SET_BY_THE_RUN, Names
+from sb3_sparse.zoo.settings import Settings
 
 OF_SPARSITY = frozenset(one.name for one in fields(SparsityConfig))
 
@@ -79,7 +80,7 @@ def _check_keys(given: Mapping[str, Any], allowed: Set[str], what: str, names: N
         elif name in names.schedule:
             cure = f"; it is the mask's schedule's: put it under {CALLBACK}"
         elif name in names.robust_value:
-            cure = f"; put it under {ROBUST_VALUE}"
+            cure = f"; put it under sb3_sparse.{ROBUST_VALUE}"
         elif name in names.algorithm:
             cure = "; it is the algorithm's: put it beside policy_kwargs"
         elif name in SET_BY_THE_RUN:

@@ -136,16 +136,18 @@ def test_returns_over_three_steps_by_hand():
     assert found == expected
 
 
+def drawn(buffer, count):
+    """A batch of a buffer with as many rows, with ends and cut-offs among them."""
+    for number in range(count):
+        add(buffer, number, done=number % 5 == 4, cut_off=number % 7 == 6)
+    np.random.seed(0)
+    return buffer.sample(50)
+
+
 @pytest.mark.parametrize("count", [3, 8, 13])
 def test_one_step_is_the_replay_buffer_of_sb3(count):
     one, other = make(8, 2), ReplayBuffer(16, VECTOR, ACTIONS, device="cpu", n_envs=2)
-    for number in range(count):
-        for buffer in (one, other):
-            add(buffer, number, done=number % 5 == 4, cut_off=number % 7 == 6)
-    batches = []
-    for buffer in (one, other):
-        np.random.seed(0)
-        batches.append(buffer.sample(50))
+    batches = [drawn(buffer, count) for buffer in (one, other)]
     for mine, theirs in zip(*batches, strict=True):
         assert (mine is None and theirs is None) or (mine == theirs).all()
     assert batches[0].discounts is None
@@ -155,14 +157,7 @@ def test_one_step_is_the_replay_buffer_of_sb3(count):
 def test_several_steps_are_those_of_sb3(count):
     one = make(8, 2, n_steps=3, gamma=0.9)
     other = NStepReplayBuffer(16, VECTOR, ACTIONS, device="cpu", n_envs=2, n_steps=3, gamma=0.9)
-    for number in range(count):
-        for buffer in (one, other):
-            add(buffer, number, done=number % 5 == 4, cut_off=number % 7 == 6)
-    batches = []
-    for buffer in (one, other):
-        np.random.seed(0)
-        batches.append(buffer.sample(50))
-    for mine, theirs in zip(*batches, strict=True):
+    for mine, theirs in zip(drawn(one, count), drawn(other, count), strict=True):
         assert (mine == theirs).all()
 
 

@@ -22,10 +22,12 @@ import sb3_sparse
 from sb3_sparse import RecycleDormantCallback, ResetCallback, SparsityCallback
 from sb3_sparse.engine.inference import Inference
 from sb3_sparse.engine.residual import Residual
-from sb3_sparse.errors import ConfigError
+from sb3_sparse.errors import ConfigError, UnsupportedError
 
 NAMES = sorted(
-    name for name, cls in ALGORITHMS.items() if "SparseSimbaPolicy" in cls.policy_aliases
+    name
+    for name, cls in ALGORITHMS.items()
+    if isinstance(cls.policy_aliases.get("SparseSimbaPolicy"), type)
 )
 ON_POLICY = ("PPO", "A2C", "TRPO")
 STORAGES = ["masked", "sparse"]
@@ -48,6 +50,8 @@ def simba(name: str, env=None, compute: str = "auto", **kwargs):
 
 def test_the_algorithms_that_have_one():
     assert set(NAMES) == set(ALGORITHMS) - {"CrossQ"}
+    with pytest.raises(UnsupportedError, match="CrossQ has no SparseSimbaPolicy; it is there for"):
+        make("CrossQ", policy="SparseSimbaPolicy")
 
 
 @pytest.mark.parametrize("compute", STORAGES)

@@ -12,9 +12,11 @@ import sb3_sparse.zoo.configs as configs
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.policies.arguments import arguments_of
 from sb3_sparse.zoo import config_path
+from sb3_sparse.zoo.callbacks import CALLBACK
 from sb3_sparse.zoo.configs import METHODS, config_folders, entry_of, evaluation_of, is_preset
 from sb3_sparse.zoo.environments import is_atari
-from sb3_sparse.zoo.settings import CALLBACK, ZOO_KEYS, Settings
+from sb3_sparse.zoo.names import ZOO_KEYS
+from sb3_sparse.zoo.settings import Settings
 from sb3_sparse.zoo.spec import RunSpec, algorithms
 from sb3_sparse.zoo.validation import check_settings
 

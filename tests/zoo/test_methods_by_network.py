@@ -18,8 +18,9 @@ from sb3_sparse.tuning.definition import Definition
 from sb3_sparse.tuning.shipped import paper_space, wide_space
 from sb3_sparse.tuning.spaces import Space
 from sb3_sparse.zoo import train
+from sb3_sparse.zoo.callbacks import CALLBACK
 from sb3_sparse.zoo.configs import config_path, read_yaml
-from sb3_sparse.zoo.settings import CALLBACK, Settings
+from sb3_sparse.zoo.settings import Settings
 from sb3_sparse.zoo.spec import RunSpec
 
 MST = {"actor": "static", "critic": "rigl"}

@@ -9,7 +9,9 @@ import pytest
 from stable_baselines3 import DQN, PPO, SAC
 
 from sb3_sparse.errors import ConfigError
-from sb3_sparse.zoo.settings import CALLBACK, Settings, parse_overrides
+from sb3_sparse.zoo.callbacks import CALLBACK
+from sb3_sparse.zoo.overrides import parse_overrides
+from sb3_sparse.zoo.settings import Settings
 from sb3_sparse.zoo.spec import RunSpec
 from sb3_sparse.zoo.validation import check_settings
 

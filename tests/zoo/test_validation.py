@@ -17,7 +17,8 @@ from sb3_sparse.tuning.backend import optuna
 from sb3_sparse.tuning.spaces import check_space
 from sb3_sparse.zoo.arguments import kind_of
 from sb3_sparse.zoo.configs import METHODS, config_root, read_yaml
-from sb3_sparse.zoo.settings import Names, Settings
+from sb3_sparse.zoo.names import Names
+from sb3_sparse.zoo.settings import Settings
 from sb3_sparse.zoo.spec import RunSpec, algorithms
 from sb3_sparse.zoo.validation import OF_SPARSITY, check_settings
 
