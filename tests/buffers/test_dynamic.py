@@ -136,7 +136,7 @@ def test_returns_over_three_steps_by_hand():
     assert found == expected
 
 
-def drawn(buffer, count):
+def filled_and_drawn(buffer, count):
     """A batch of a buffer with as many rows, with ends and cut-offs among them."""
     for number in range(count):
         add(buffer, number, done=number % 5 == 4, cut_off=number % 7 == 6)
@@ -147,7 +147,7 @@ def drawn(buffer, count):
 @pytest.mark.parametrize("count", [3, 8, 13])
 def test_one_step_is_the_replay_buffer_of_sb3(count):
     one, other = make(8, 2), ReplayBuffer(16, VECTOR, ACTIONS, device="cpu", n_envs=2)
-    batches = [drawn(buffer, count) for buffer in (one, other)]
+    batches = [filled_and_drawn(buffer, count) for buffer in (one, other)]
     for mine, theirs in zip(*batches, strict=True):
         assert (mine is None and theirs is None) or (mine == theirs).all()
     assert batches[0].discounts is None
@@ -157,7 +157,8 @@ def test_one_step_is_the_replay_buffer_of_sb3(count):
 def test_several_steps_are_those_of_sb3(count):
     one = make(8, 2, n_steps=3, gamma=0.9)
     other = NStepReplayBuffer(16, VECTOR, ACTIONS, device="cpu", n_envs=2, n_steps=3, gamma=0.9)
-    for mine, theirs in zip(drawn(one, count), drawn(other, count), strict=True):
+    batches = [filled_and_drawn(buffer, count) for buffer in (one, other)]
+    for mine, theirs in zip(*batches, strict=True):
         assert (mine == theirs).all()
 
 
