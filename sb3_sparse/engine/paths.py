@@ -14,7 +14,7 @@ from sb3_sparse.engine.residual import Residual
 Paths = Sequence[Sequence[nn.Module]]
 """The modules of each network, in the order of computation."""
 OWN = ("torch.nn.", "sb3_sparse.engine.")
-"""Modules that define a plain ``Sequential``; a user's subclass may do more than call its parts."""
+"""Modules that define a plain ``Sequential``."""
 
 
 class Part(NamedTuple):
@@ -33,6 +33,16 @@ class Part(NamedTuple):
     shortcut: int | None = None
 
 
+def is_sequence(module: nn.Module) -> bool:
+    """Whether a module calls its parts in turn; a user's ``Sequential`` may do more."""
+    return isinstance(module, nn.Sequential) and type(module).__module__.startswith(OWN)
+
+
+def is_residual(module: nn.Module) -> bool:
+    """Whether a module adds to its input what its parts make of it."""
+    return isinstance(module, Residual) and type(module).forward is Residual.forward
+
+
 def parts_of(path: Iterable[nn.Module]) -> list[Part] | None:
     """Split a path into layers and what surrounds them; None if it has any other module."""
     parts: list[Part] = []
@@ -46,10 +56,10 @@ def _split(path: Iterable[nn.Module], parts: list[Part]) -> bool:
     for module in path:
         last = parts[-1] if parts else None
         behind_norm = last is not None and last.layer is None
-        if isinstance(module, nn.Sequential) and type(module).__module__.startswith(OWN):
-            if not _split(module, parts):
+        if is_sequence(module):
+            if not _split(module.children(), parts):
                 return False
-        elif isinstance(module, Residual):
+        elif is_residual(module):
             if behind_norm or not _split_residual(module, parts):
                 return False
         elif type(module) in (nn.Linear, SparseLinear):
@@ -69,10 +79,10 @@ def _split(path: Iterable[nn.Module], parts: list[Part]) -> bool:
     return True
 
 
-def _split_residual(module: Residual, parts: list[Part]) -> bool:
+def _split_residual(module: nn.Module, parts: list[Part]) -> bool:
     before = len(parts)
     inner: list[Part] = []  # of its own, so that no activation belongs to a layer before the block
-    if type(module).forward is not Residual.forward or not _split([module.residual], inner):
+    if not _split(module.children(), inner):
         return False
     if not inner or inner[-1].layer is None or inner[-1].shortcut is not None:
         return False

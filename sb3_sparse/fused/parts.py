@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from torch import nn
 
 from sb3_sparse.engine.activations import ACTIVATIONS
 from sb3_sparse.engine.linear import SparseLinear
-from sb3_sparse.engine.paths import parts_of
-from sb3_sparse.engine.residual import Residual
+from sb3_sparse.engine.paths import is_residual, is_sequence, parts_of
 from sb3_sparse.fused.errors import NotCovered
 from sb3_sparse.fused.program import Parts
 
@@ -31,19 +32,15 @@ def parts(*modules: nn.Module) -> Parts:
     """
     found = parts_of(modules)
     if found is None:
-        leaves = [m for module in modules for m in module.modules() if not [*m.children()]]
-        others = {type(m).__name__ for m in leaves if type(m) not in KNOWN_MODULES}
-        if others:
-            raise NotCovered(f"a network with {', '.join(sorted(others))}")
-        order = ", ".join(type(m).__name__ for m in leaves)
-        own = [
-            type(m).__name__
-            for module in modules
-            for m in module.modules()
-            if [*m.children()] and not isinstance(m, nn.Sequential) and type(m) is not Residual
-            and type(m).forward is not Residual.forward
-        ]  # fmt: skip
-        raise NotCovered(
-            f"a network with {own[0]}" if own else f"a network of {order} in this order"
-        )
+        raise NotCovered(f"a network {_obstacle(modules)}")
     return found
+
+
+def _obstacle(modules: Iterable[nn.Module]) -> str:
+    """Say what makes a network one that programs do not know."""
+    inner = [m for module in modules for m in module.modules()]
+    parts = [m for m in inner if not is_sequence(m) and not is_residual(m)]
+    others = {type(m).__name__ for m in parts if type(m) not in KNOWN_MODULES}
+    if others:
+        return f"with {', '.join(sorted(others))}"
+    return f"of {', '.join(type(m).__name__ for m in parts)} in this order"
