@@ -13,7 +13,7 @@ from sb3_sparse.analysis.batches import sample_batch
 from sb3_sparse.analysis.wiring import Wiring, wiring_of
 from sb3_sparse.callbacks.initial import initial_state, sparse_policy_of
 from sb3_sparse.callbacks.interval import IntervalCallback, check_whole
-from sb3_sparse.engine.masked import clear_moments
+from sb3_sparse.engine.moments import clear_moments
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.policies.base import BaseSparsePolicy
 from sb3_sparse.policies.compiled import plain_names

@@ -14,12 +14,13 @@ from torch.utils.hooks import RemovableHandle
 from sb3_sparse.engine.auto import AutoCompute
 from sb3_sparse.engine.foreign import watch
 from sb3_sparse.engine.hooks import Hooks
+from sb3_sparse.engine.moments import save_moments
 from sb3_sparse.engine.network import SparseNetwork
 from sb3_sparse.engine.optimizers import acts_elementwise, add_weight_decay, keep_implementation
 from sb3_sparse.engine.plan import Plan, warn_of_no_plan
 from sb3_sparse.engine.plans import Plans
 from sb3_sparse.engine.sequential import chain_up
-from sb3_sparse.engine.storage import LayerStorage, check_masked, save_moments
+from sb3_sparse.engine.storage import LayerStorage, check_masked
 
 
 class Controller:

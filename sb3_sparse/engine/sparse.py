@@ -14,7 +14,8 @@ from torch import nn
 from sb3_sparse.engine.gradients import DenseGradient, GradientMask, weakly
 from sb3_sparse.engine.linear import SparseLinear
 from sb3_sparse.engine.masked import MaskedStorage
-from sb3_sparse.engine.storage import LayerStorage, moments_of
+from sb3_sparse.engine.moments import moments_of
+from sb3_sparse.engine.storage import LayerStorage
 from sb3_sparse.engine.structure import Structure
 from sb3_sparse.errors import UnsupportedError
 
@@ -268,7 +269,7 @@ def _followed(
     after: Structure,
     carried: Callable[[th.Tensor], th.Tensor],
 ) -> th.Tensor:
-    """As :func:`~sb3_sparse.engine.masked.follow_mask`, on values."""
+    """As :func:`~sb3_sparse.engine.masked_gradients.follow_mask`, on values."""
     moved = carried(grad)
     if dense_grad is None:
         return moved

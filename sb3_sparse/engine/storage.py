@@ -242,38 +242,6 @@ class LayerStorage(ABC):
         self._move(after, optimizers, soft_targets, dense_grad)
 
 
-def moments_of(
-    optimizers: Sequence[th.optim.Optimizer], weight: nn.Parameter
-) -> list[tuple[dict[str, Any], str, th.Tensor]]:
-    """Find the moments of ``weight``: each with the state and the key under which it is kept.
-
-    They are the tensors that have dimensions: Adam's two moments, a momentum buffer, but no step
-    count.
-    """
-    return [
-        (state, key, value)
-        for optimizer in optimizers
-        if (state := optimizer.state.get(weight))
-        for key, value in state.items()
-        if isinstance(value, th.Tensor) and value.dim()
-    ]
-
-
-def save_moments(
-    optimizer: th.optim.Optimizer, state_dict: dict[str, Any], layers: Iterable[LayerStorage]
-) -> None:
-    """Write moments of sparse layers into an optimizer's state_dict as masked layers have them."""
-    parameters = [p for group in optimizer.param_groups for p in group["params"]]
-    numbers = {id(parameter): number for number, parameter in enumerate(parameters)}
-    for layer in layers:
-        number = numbers.get(id(layer.weight))
-        if layer.is_sparse and number in state_dict["state"]:
-            state_dict["state"][number] = {
-                key: layer.saved_moment(value) if isinstance(value, th.Tensor) else value
-                for key, value in state_dict["state"][number].items()
-            }
-
-
 def check_masked(optimizer: th.optim.Optimizer, layers: Iterable[LayerStorage]) -> None:
     """Reject sparse storage under an optimizer that does not move each weight by itself.
 
