@@ -25,14 +25,14 @@ from sb3_sparse.engine.chains import watched
 from sb3_sparse.engine.changes import patched
 from sb3_sparse.engine.internals import any_global_hook, watching
 from sb3_sparse.engine.linear import TRIES, SparseLinear
-from sb3_sparse.engine.masked import FLOAT_MASK_KEY, MaskedStorage
+from sb3_sparse.engine.masked import MaskedStorage
 from sb3_sparse.engine.native.library import bits_of, library, readable, why_missing
-from sb3_sparse.engine.paths import Paths, modules_of, parts_of
+from sb3_sparse.engine.paths import Paths, modules_of
+from sb3_sparse.engine.steps import Step, steps_of, tensors_of
 from sb3_sparse.engine.structure import Structure
 
 MOST_INPUTS = 16
-MOST_STEPS = 64
-"""``LANES`` and ``MOST_STEPS`` of ``kernels.h``."""
+"""``LANES`` of ``kernels.h``."""
 DOUBLES: dict[Any, bool] = {
     **{th.float32: False, th.float64: True},
     **{np.dtype(np.float32): False, np.dtype(np.float64): True},
@@ -43,24 +43,6 @@ DOUBLES: dict[Any, bool] = {
 def by_modules(x: th.Tensor) -> bool:
     """Whether networks must act module by module: to be observed or compiled."""
     return is_compiling() or watched(x)
-
-
-class Step(NamedTuple):
-    """One layer, and what surrounds it as in :class:`~sb3_sparse.engine.paths.Part`.
-
-    :param layer: the layer
-    :param activation: None: no activation
-    :param norm: LayerNorm of its input; None: there is none
-    :param source: number of the step that gives its input; -1: the observations
-    :param shortcut: number of the step whose result is added, -1: the observations; None: nothing
-        is added
-    """
-
-    layer: nn.Linear
-    activation: nn.Module | None
-    norm: nn.LayerNorm | None
-    source: int
-    shortcut: int | None
 
 
 class Binding(NamedTuple):
@@ -95,7 +77,7 @@ class Inference:
         hooks = ((vars(m)["_forward_hooks"], vars(m)["_forward_pre_hooks"]) for m in modules)
         self._hooks = list(chain.from_iterable(hooks))
         self._tensors: list[th.Tensor] = [
-            tensor for step in steps for tensor in _tensors_of(step) if tensor is not None
+            tensor for step in steps for tensor in tensors_of(step) if tensor is not None
         ]
         numbers = {id(tensor): number for number, tensor in enumerate(self._tensors)}
         self._values = [numbers[id(layer.weight)] for layer in self._sparse]
@@ -110,33 +92,10 @@ class Inference:
         :param hooked: modules around the networks, whose hooks expect to see the call
         """
         modules = [*hooked, *modules_of(paths)]
-        if not paths or any(map(patched, modules)) or why_missing() is not None:
+        if any(map(patched, modules)) or why_missing() is not None:
             return None
-        steps: list[Step] = []
-        places: dict[tuple[int, ...], int] = {}
-        ends = []
-        for path in paths:
-            parts = parts_of(path)
-            if not parts:
-                return None
-            key: tuple[int, ...] = ()
-            numbers = [-1]  # of the steps of this path, behind the observations
-            for layer, activation, norm, shortcut in parts:
-                if layer is None:
-                    return None
-                key += (id(layer), id(activation), id(norm), -2 if shortcut is None else shortcut)
-                if key not in places:
-                    places[key] = len(steps)
-                    added = None if shortcut is None else numbers[shortcut + 1]
-                    steps.append(Step(layer, activation, norm, numbers[-1], added))
-                numbers.append(places[key])
-            ends.append(numbers[-1])
-        inputs = {step.layer.in_features for step in steps if step.source < 0}
-        if not all(_fits(step, steps) for step in steps):
-            return None
-        if len(steps) > MOST_STEPS or len(set(ends)) < len(ends) or len(inputs) > 1:
-            return None
-        return cls(steps, ends, modules)
+        found = steps_of(paths)
+        return None if found is None else cls(*found, modules)
 
     @property
     def watched(self) -> bool:
@@ -274,7 +233,7 @@ class Inference:
                 if structure.shape != shape:
                     return None
             places = []
-            for tensor, size in zip(_tensors_of(step), sizes, strict=True):
+            for tensor, size in zip(tensors_of(step), sizes, strict=True):
                 place = 0
                 if tensor is not None:
                     now = next(held)
@@ -293,24 +252,3 @@ class Inference:
             fields += (bits_of(epsilon), scale, shift)
             fields.append(-2 if step.shortcut is None else step.shortcut)
         return (ctypes.c_int64 * len(fields))(*fields)
-
-
-def _tensors_of(step: Step) -> tuple[th.Tensor | None, ...]:
-    """Return the weight, bias and mask of a step's layer, and its norm's scale and shift."""
-    layer, norm = step.layer, step.norm
-    affine = (None, None) if norm is None else (norm.weight, norm.bias)
-    return layer.weight, layer.bias, layer._buffers.get(FLOAT_MASK_KEY), *affine
-
-
-def _fits(step: Step, steps: list[Step]) -> bool:
-    """Whether a step, its norm and what is added to it agree in their numbers of features."""
-    columns, rows = step.layer.in_features, step.layer.out_features
-
-    def width(source: int, first: int) -> int:
-        return first if source < 0 else steps[source].layer.out_features
-
-    return (
-        width(step.source, columns) == columns
-        and (step.norm is None or step.norm.normalized_shape == (columns,))
-        and (step.shortcut is None or width(step.shortcut, steps[0].layer.in_features) == rows)
-    )
