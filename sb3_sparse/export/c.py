@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_sparse.export import ckernels
+from sb3_sparse.export.cheader import PROTOTYPE, WIDTH, about, declarations
 from sb3_sparse.export.graph import Graph
 from sb3_sparse.export.layout import grouped, side_by_side
 from sb3_sparse.export.memory import Memory, bordered_shape, plan_memory
@@ -34,8 +35,6 @@ from sb3_sparse.export.nodes import (
 )
 from sb3_sparse.export.quantize import quantize_rows
 
-PROTOTYPE = "void sb3_sparse_policy(const float *obs, float *action)"
-WIDTH = 100
 BYTES = {"float": 4, "int8_t": 1, "uint16_t": 2, "uint32_t": 4}
 
 
@@ -70,7 +69,7 @@ def write_c(graph: Graph, version: str, int8: bool = False) -> CSource:
     body = "\n".join(f"    {line}" for line in writer.calls)
     ram = 4 * writer.memory.size
     memory = f"static float memory[{writer.memory.size}];\n\n" if ram else ""
-    comment = _about(graph, version, writer.flash, ram)
+    comment = about(graph, version, writer.flash, ram)
     includes = "#include <stdint.h>\n"
     if any(f"{name}(" in functions for name in ckernels.MATH):
         includes = "#include <math.h>\n" + includes
@@ -78,7 +77,7 @@ def write_c(graph: Graph, version: str, int8: bool = False) -> CSource:
         f"{comment}{includes}\n{PROTOTYPE};\n\n{memory}{functions}\n{tables}\n\n"
         f"{PROTOTYPE}\n{{\n{body}\n}}\n"
     )
-    header = comment + _declarations(graph)
+    header = comment + declarations(graph)
     return CSource(source, header, writer.flash, ram)
 
 
@@ -270,48 +269,3 @@ def _number(value: Any) -> str:
 
 def _size(node: Node) -> str:
     return str(int(np.prod(node.shape)))
-
-
-def _about(graph: Graph, version: str, flash: int, ram: int) -> str:
-    """Return the comment that both files begin with."""
-    lines = [
-        f"A policy of {graph.nnz} connections, written by sb3_sparse {version}.",
-        f"Flash: {flash} bytes of constants, and the code. RAM: {ram} bytes, no heap.",
-        *textwrap.wrap(f"In: one observation of {_asked(graph)}, raw.", WIDTH - 3),
-        f"Out: {_given(graph)}.",
-    ]
-    return "/*\n" + "".join(f" * {line}\n" for line in lines).replace("*/", "* /") + " */\n"
-
-
-def _declarations(graph: Graph) -> str:
-    """Return the header without its comment."""
-    return (
-        "#ifndef SB3_SPARSE_POLICY_H\n#define SB3_SPARSE_POLICY_H\n\n"
-        f"#define SB3_SPARSE_OBSERVATION_SIZE {int(np.prod(graph.observation_shape))}\n"
-        f"#define SB3_SPARSE_ACTION_SIZE {graph.nodes[-1].shape[0]}\n\n"
-        '#ifdef __cplusplus\nextern "C" {\n#endif\n\n'
-        "/* Not reentrant: its intermediate values are static. */\n"
-        f"{PROTOTYPE};\n\n"
-        "#ifdef __cplusplus\n}\n#endif\n\n#endif\n"
-    )
-
-
-def _shape(shape: tuple[int, ...]) -> str:
-    return "x".join(map(str, shape))
-
-
-def _asked(graph: Graph) -> str:
-    if not graph.parts:
-        return _shape(graph.observation_shape)
-    parts = [f"{part.key!r} ({_shape(part.shape or (1,))})" for part in graph.parts]
-    return f"{graph.observation_shape[0]} numbers: {', then '.join(parts)}"
-
-
-def _given(graph: Graph) -> str:
-    last, actions = graph.nodes[-1], graph.nodes[-1].shape[0]
-    if isinstance(last, Argmax):
-        choices = ", ".join(map(str, last.sizes))
-        return f"{actions} whole number{'s' * (actions > 1)}, below {choices}"
-    if isinstance(last, Positive):
-        return f"{actions} times 0 or 1"
-    return f"{actions} number{'s' * (actions > 1)}, within the action space's bounds"

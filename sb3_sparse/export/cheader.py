@@ -1,0 +1,58 @@
+"""The header of a policy in C: what the caller declares, and the comment that explains it."""
+
+from __future__ import annotations
+
+import textwrap
+
+import numpy as np
+
+from sb3_sparse.export.graph import Graph
+from sb3_sparse.export.nodes import Argmax, Positive
+
+PROTOTYPE = "void sb3_sparse_policy(const float *obs, float *action)"
+WIDTH = 100
+
+
+def about(graph: Graph, version: str, flash: int, ram: int) -> str:
+    """Return the comment that both files begin with."""
+    lines = [
+        f"A policy of {graph.nnz} connections, written by sb3_sparse {version}.",
+        f"Flash: {flash} bytes of constants, and the code. RAM: {ram} bytes, no heap.",
+        *textwrap.wrap(f"In: one observation of {_asked(graph)}, raw.", WIDTH - 3),
+        f"Out: {_given(graph)}.",
+    ]
+    return "/*\n" + "".join(f" * {line}\n" for line in lines).replace("*/", "* /") + " */\n"
+
+
+def declarations(graph: Graph) -> str:
+    """Return the header without its comment."""
+    return (
+        "#ifndef SB3_SPARSE_POLICY_H\n#define SB3_SPARSE_POLICY_H\n\n"
+        f"#define SB3_SPARSE_OBSERVATION_SIZE {int(np.prod(graph.observation_shape))}\n"
+        f"#define SB3_SPARSE_ACTION_SIZE {graph.nodes[-1].shape[0]}\n\n"
+        '#ifdef __cplusplus\nextern "C" {\n#endif\n\n'
+        "/* Not reentrant: its intermediate values are static. */\n"
+        f"{PROTOTYPE};\n\n"
+        "#ifdef __cplusplus\n}\n#endif\n\n#endif\n"
+    )
+
+
+def _shape(shape: tuple[int, ...]) -> str:
+    return "x".join(map(str, shape))
+
+
+def _asked(graph: Graph) -> str:
+    if not graph.parts:
+        return _shape(graph.observation_shape)
+    parts = [f"{part.key!r} ({_shape(part.shape or (1,))})" for part in graph.parts]
+    return f"{graph.observation_shape[0]} numbers: {', then '.join(parts)}"
+
+
+def _given(graph: Graph) -> str:
+    last, actions = graph.nodes[-1], graph.nodes[-1].shape[0]
+    if isinstance(last, Argmax):
+        choices = ", ".join(map(str, last.sizes))
+        return f"{actions} whole number{'s' * (actions > 1)}, below {choices}"
+    if isinstance(last, Positive):
+        return f"{actions} times 0 or 1"
+    return f"{actions} number{'s' * (actions > 1)}, within the action space's bounds"
