@@ -13,7 +13,8 @@ from support import make
 from sb3_sparse import cli
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.export.numpy_policy import Policy
-from sb3_sparse.zoo.saved import SavedModel, algos_of
+from sb3_sparse.zoo.saved import SavedModel
+from sb3_sparse.zoo.saved_by import algos_of
 from sb3_sparse.zoo.spec import RunSpec
 from sb3_sparse.zoo.training import train
 

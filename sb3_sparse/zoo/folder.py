@@ -2,37 +2,26 @@
 
 from __future__ import annotations
 
-import os
 import shutil
-import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from filelock import FileLock, Timeout
-
-from sb3_sparse.errors import ConfigError, CorruptStateError, RunBusy
+from sb3_sparse.errors import ConfigError
 from sb3_sparse.files import written_whole
 from sb3_sparse.loading.text import read_json
-from sb3_sparse.loading.zooyaml import check_built, read_zoo_yaml
-from sb3_sparse.zoo.disk import writing
-from sb3_sparse.zoo.environments import package_names, plain_id
+from sb3_sparse.zoo.lock import is_locked, locked
 from sb3_sparse.zoo.record import CURE, FORMAT, NAME, WHAT, Record, as_json
+from sb3_sparse.zoo.run_files import ARGUMENTS, read_arguments
 
 VECNORMALIZE = "vecnormalize.pkl"
-CONFIG = "config.yml"
-ARGUMENTS = "args.yml"
 BEST = "best_model.zip"
 EVALUATIONS = "evaluations.npz"
 MONITOR = ".monitor.csv"
 REPLAY_BUFFER = "replay_buffer"
 EXAMPLE = "logs/sac/HalfCheetah-v5_1"
-OF_ENVIRONMENT = ("env_wrapper", "vec_env_wrapper", "frame_stack", "env_kwargs", "normalize")
-"""The settings that decide how a run's environments are made."""
-RESTORE = "restore it, or copy the zip out of the folder and give it with --env and --vecnormalize"
-PATIENCE = 1.0  # seconds; other processes hold the lock briefly to test it
 
 
 def env_name(env_id: str) -> str:
@@ -167,20 +156,7 @@ class RunFolder:
                 f"there is no run in {self}; give the run's own folder, e.g. {EXAMPLE}"
             )
         (path,) = files
-        arguments = read_zoo_yaml(path, RESTORE)
-        for name in ("algo", "env"):
-            if not isinstance(arguments.get(name), str):
-                raise CorruptStateError(
-                    f"{path} is damaged: {name} must be a name, got {arguments.get(name)!r}; "
-                    f"{RESTORE}"
-                )
-        kwargs = arguments.get("env_kwargs")
-        check_built(kwargs, f"env_kwargs in {path}")
-        if kwargs is not None and not _names(kwargs):
-            raise CorruptStateError(
-                f"{path} is damaged: env_kwargs must map names to values, got {kwargs!r}; {RESTORE}"
-            )
-        return arguments
+        return read_arguments(path)
 
     def _check_compression(self) -> None:
         """Raise if this folder is one of ``sb3-sparse compress``."""
@@ -207,29 +183,12 @@ class RunFolder:
         :raises RunBusy: if another process trains it already
         :raises Unwritable: if the folder is not writable
         """
-        lock = FileLock(self._lock)
-        try:
-            with writing(self.path, "free space or make it writable, then repeat the command"):
-                lock.acquire(timeout=PATIENCE)
-        except Timeout as error:
-            raise RunBusy(f"another process is at work in {self}") from error
-        try:
+        with locked(self._lock):
             yield
-        finally:
-            with suppress(OSError):  # Windows keeps an open file
-                self._lock.unlink()
-            lock.release()
 
     def is_locked(self) -> bool:
         """Whether a process is training the run; the check writes nothing."""
-        try:
-            descriptor = os.open(self._lock, os.O_RDONLY)
-        except FileNotFoundError:
-            return False
-        try:
-            return not _can_lock(descriptor)
-        finally:
-            os.close(descriptor)
+        return is_locked(self._lock)
 
     @property
     def checkpoints(self) -> Path:
@@ -279,85 +238,25 @@ class RunFolder:
                     path.unlink()
 
 
-def environment_in(arguments: Mapping[str, Any]) -> tuple[str | None, tuple[str, ...]]:
-    """Return the environment's plain id in a run's arguments, and the modules that register it.
+def locate(path: Path | str, best: bool = False) -> tuple[Path, RunFolder]:
+    """Return a model's zip and its folder, which may be a run's.
 
-    :param arguments: as :meth:`RunFolder.arguments` returns them
+    :param path: a run's folder, or a zip, with or without its suffix
+    :param best: take a folder's best policy instead of its last
+    :raises ConfigError: if a folder holds no run or no such model
     """
-    packages = package_names(arguments.get("gym_packages"))
-    env_id = arguments.get("env")
-    return (None, packages) if env_id is None else plain_id(str(env_id), packages)
+    path = Path(path)
+    if not RunFolder(path).is_run:  # a run may have a folder that is named like its zip
+        path = _zip_path(path)
+    if not path.is_dir():
+        return path, RunFolder(path.parent)
+    folder = RunFolder(path)
+    return folder.model(folder.arguments()["env"], best), folder
 
 
-def environment_settings(parameters: Path) -> dict[str, Any]:
-    """Read how a run's environments are made: wrappers, stacking, arguments, normalisation.
-
-    :param parameters: folder of the run's ``config.yml``
-    :return: the settings of :data:`OF_ENVIRONMENT` that the file has, ``normalize`` as a bool
-    :raises ConfigError: if there is no such file
-    :raises CorruptStateError: if the file is damaged
-    """
-    path = parameters / CONFIG
-    if not path.is_file():
-        raise ConfigError(
-            f"{path} is missing, which records how the run's environment was wrapped, stacked and "
-            f"normalised; {RESTORE}"
-        )
-    content = read_zoo_yaml(path, RESTORE)
-    settings = {
-        name: content[name] for name in OF_ENVIRONMENT if content.get(name) not in (None, 0)
-    }
-    check_built(settings, str(path))
-    stack = settings.get("frame_stack", 1)
-    allowed = {
-        "frame_stack": type(stack) is int and 1 <= stack <= 1000,
-        "env_kwargs": _names(settings.get("env_kwargs", {})),
-        **{name: _wrappers(settings.get(name, [])) for name in ("env_wrapper", "vec_env_wrapper")},
-    }
-    for name, fits in allowed.items():
-        if not fits:
-            raise CorruptStateError(
-                f"{path} is damaged: {name} cannot be {settings[name]!r}; {RESTORE}"
-            )
-    settings["normalize"] = bool(settings.get("normalize", False))
-    return settings
-
-
-def zip_path(path: Path) -> Path:
+def _zip_path(path: Path) -> Path:
     """Add the suffix that SB3 adds, if the path lacks one and the file exists."""
     if not path.name or path.suffix:
         return path
     with_suffix = path.with_suffix(".zip")
     return with_suffix if with_suffix.is_file() else path
-
-
-def _names(value: Any) -> bool:
-    return isinstance(value, dict) and all(isinstance(name, str) for name in value)
-
-
-def _wrappers(value: Any) -> bool:
-    """Whether a value is a dotted path, a path with its arguments, or a list of these."""
-    return all(
-        isinstance(one, str)
-        or (_names(one) and len(one) == 1 and all(_names(given) for given in one.values()))
-        for one in (value if isinstance(value, list) else [value])
-    )
-
-
-def _can_lock(descriptor: int) -> bool:
-    if sys.platform == "win32":
-        import msvcrt
-
-        try:
-            msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
-            msvcrt.locking(descriptor, msvcrt.LK_UNLCK, 1)
-        except OSError:
-            return False
-        return True
-    import fcntl
-
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)  # released when the file closes
-    except BlockingIOError:
-        return False
-    return True

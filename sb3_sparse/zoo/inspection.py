@@ -12,9 +12,9 @@ from sb3_sparse.loading.zips import check_state, look_into
 from sb3_sparse.policies.report import SPARSE, SparsityReport
 from sb3_sparse.policies.storage import KNOWN_PACKAGES
 from sb3_sparse.zoo.computing import Computing, computing_in, layers_in
+from sb3_sparse.zoo.folder import locate
 from sb3_sparse.zoo.outline import Outline, outline_of
 from sb3_sparse.zoo.positions import image_in
-from sb3_sparse.zoo.saved import locate
 
 
 @dataclass(frozen=True)

@@ -2,33 +2,26 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import yaml
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import check_for_correct_spaces
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper, VecFrameStack
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecFrameStack
 
 from sb3_sparse.errors import ConfigError, CorruptStateError, MissingExtra, SparsityError
 from sb3_sparse.loading.guard import reading
-from sb3_sparse.loading.statistics import load_statistics, read_statistics
 from sb3_sparse.loading.text import read_text
 from sb3_sparse.loading.zips import check_state, look_into, read_model
 from sb3_sparse.loading.zooyaml import NotBuilt
-from sb3_sparse.policies.arguments import import_path
 from sb3_sparse.policies.compiled import unwrapped
-from sb3_sparse.policies.internals import COUNTERS, LAST_SEEN, wrapped
-from sb3_sparse.policies.registry import possible_algorithms
-from sb3_sparse.policies.saving import differ
+from sb3_sparse.policies.internals import wrapped
 from sb3_sparse.sparsity.numeric import is_whole
-from sb3_sparse.zoo.arguments import Kind, kind_of
+from sb3_sparse.zoo.attributes import check_attributes
 from sb3_sparse.zoo.environments import (
     import_packages,
     is_atari,
@@ -36,27 +29,26 @@ from sb3_sparse.zoo.environments import (
     mujoco_warns_once,
     package_names,
 )
-from sb3_sparse.zoo.folder import (
+from sb3_sparse.zoo.folder import RunFolder, locate
+from sb3_sparse.zoo.manager import load_for_prediction, loadable_algorithms, quiet
+from sb3_sparse.zoo.normalization import normalized, statistics_of
+from sb3_sparse.zoo.prepare import setup_errors
+from sb3_sparse.zoo.run_files import (
     ARGUMENTS,
     CONFIG,
     RESTORE,
-    VECNORMALIZE,
-    RunFolder,
     environment_in,
     environment_settings,
-    zip_path,
 )
-from sb3_sparse.zoo.manager import load_for_prediction, loadable_algorithms, quiet
-from sb3_sparse.zoo.prepare import setup_errors
-from sb3_sparse.zoo.spec import RunSpec, algorithms
+from sb3_sparse.zoo.saved_by import algo_of
+from sb3_sparse.zoo.spec import algorithms
+from sb3_sparse.zoo.wrappers import check_wrappers
 
 try:
     from rl_zoo3.utils import create_test_env
 except ImportError as error:
     raise MissingExtra("the environments of a saved model", "zoo") from error
 
-COUNTED = ("num_timesteps", *COUNTERS)
-WHOLE = Kind("a whole number, 0 or more", lambda v: is_whole(v) and v >= 0)
 EVALUATION_ENVS = 10
 
 
@@ -79,7 +71,7 @@ class SavedModel:
     :param parameters: folder of its run's ``config.yml`` and normalisation; None: it has no run
     :param vecnormalize: statistics that normalised its observations; None: nothing did
     :param settings: how its environments were made, by the names of
-        :data:`~sb3_sparse.zoo.folder.OF_ENVIRONMENT`; empty if it has no run
+        :data:`~sb3_sparse.zoo.run_files.OF_ENVIRONMENT`; empty if it has no run
     :param gym_packages: modules that register its environment or algorithm
     """
 
@@ -127,19 +119,11 @@ class SavedModel:
                 f"{parameters / ARGUMENTS} is damaged: algo is {arguments['algo']!r}; known are "
                 f"{', '.join(loadable_algorithms())}"
             )
-        algo = _algo(path, algo, arguments.get("algo"))
+        algo = algo_of(path, algo, arguments.get("algo"))
         settings: Mapping[str, Any] = {}
         if parameters is not None and (vecnormalize is None or (parameters / CONFIG).is_file()):
             settings = environment_settings(parameters)
-        if vecnormalize is None:
-            vecnormalize = _statistics_of_run(parameters, settings) if parameters else None
-        if vecnormalize is None and parameters is None:
-            _check_lone(path, algo)
-        if vecnormalize is not None and not vecnormalize.is_file():
-            raise ConfigError(
-                f"there is no file {vecnormalize}; give what VecNormalize.save wrote, e.g. "
-                f"{VECNORMALIZE}"
-            )
+        vecnormalize = statistics_of(path, algo, vecnormalize, parameters, settings)
         return cls(path, algo, env_id, parameters, vecnormalize, settings, packages)
 
     def load(self, env: VecEnv | None = None) -> BaseAlgorithm:
@@ -257,9 +241,7 @@ class SavedModel:
             )
         try:
             if self.vecnormalize is not None:
-                envs = load_statistics(self.vecnormalize, envs)
-                envs.training = training
-                envs.norm_reward = training and envs.norm_reward
+                envs = normalized(envs, self.vecnormalize, training)
             if settings.get("frame_stack"):
                 with setup_errors(f"frames of {env_id} cannot be stacked", env_id):
                     envs = VecFrameStack(envs, settings["frame_stack"])
@@ -303,163 +285,15 @@ class SavedModel:
         parameters = RunFolder(folder).parameters(env_id)
         parameters.mkdir(parents=True, exist_ok=True)
         arguments: dict[str, Any] = {"env_kwargs": None, "seed": 0}
-        normalized = self.vecnormalize is not None
-        settings = yaml.dump({"normalize": normalized})
+        normalize = self.vecnormalize is not None
+        settings = yaml.dump({"normalize": normalize})
         if self.parameters is not None:
             known = RunFolder(self.parameters.parent).arguments()
             arguments = {key: one for key, one in known.items() if not isinstance(one, NotBuilt)}
             if self.settings:
                 settings = read_text(self.parameters / CONFIG, "YAML file of a run", RESTORE)
-                if self.settings["normalize"] != normalized:  # statistics were given for it
-                    settings = yaml.dump({**self.settings, "normalize": normalized})
+                if self.settings["normalize"] != normalize:  # statistics were given for it
+                    settings = yaml.dump({**self.settings, "normalize": normalize})
         arguments |= {"algo": self.algo, "env": env_id, "gym_packages": list(self.gym_packages)}
         (parameters / ARGUMENTS).write_text(yaml.dump(arguments), encoding="utf-8")
         (parameters / CONFIG).write_text(settings, encoding="utf-8")
-
-
-def locate(path: Path | str, best: bool = False) -> tuple[Path, RunFolder]:
-    """Return a model's zip and its folder, which may be a run's.
-
-    :param path: a run's folder, or a zip, with or without its suffix
-    :param best: take a folder's best policy instead of its last
-    :raises ConfigError: if a folder holds no run or no such model
-    """
-    path = Path(path)
-    if not RunFolder(path).is_run:  # a run may have a folder that is named like its zip
-        path = zip_path(path)
-    if not path.is_dir():
-        return path, RunFolder(path.parent)
-    folder = RunFolder(path)
-    return folder.model(folder.arguments()["env"], best), folder
-
-
-def check_wrappers(settings: Mapping[str, Any]) -> None:
-    """Reject anything but wrappers: calling whatever a file names could run any code.
-
-    :raises ConfigError: naming the first that is not a wrapper
-    """
-    for name, kind in (("env_wrapper", gym.Wrapper), ("vec_env_wrapper", VecEnvWrapper)):
-        given = settings.get(name) or []
-        for one in given if isinstance(given, list) else [given]:
-            path = one if isinstance(one, str) else next(iter(one))
-            found = import_path(path)
-            if not (isinstance(found, type) and issubclass(found, kind)):
-                raise ConfigError(
-                    f"{name} {path} is not a subclass of {kind.__module__}.{kind.__name__}; "
-                    "make it one"
-                )
-
-
-def check_attributes(path: Path, algo: str, data: Mapping[str, Any]) -> None:
-    """Reject a model with a setting that it cannot be trained with.
-
-    :param path: the model's zip
-    :param algo: algorithm, e.g. ``"sac"``
-    :param data: the model's attributes; only plain values are checked
-    :raises CorruptStateError: naming the setting and what it may be
-    """
-    for name, value in data.items():
-        kind = WHOLE if name in COUNTED else kind_of(algo, name)
-        plain = value is None or isinstance(value, (bool, int, float, str, list, dict))
-        if kind is not None and plain and not kind.fits(value):
-            raise CorruptStateError(
-                f"{path} cannot be trained further: {name} must be {kind.allowed}, got {value!r}. "
-                "Load it, correct that and save it again, or use an earlier model"
-            )
-    episodes = {type(data.get(name)) for name in ("ep_info_buffer", "ep_success_buffer")}
-    if episodes not in ({deque}, {type(None)}):
-        raise CorruptStateError(
-            f"{path} is damaged: a buffer of episodes is missing or of another type; use an "
-            "earlier model"
-        )
-
-
-def check_start(start: Path, run: RunSpec) -> None:
-    """Reject a model or statistics that training cannot resume from.
-
-    :param start: folder of a checkpoint, or of the run
-    :param run: the run to resume
-    :raises ConfigError: if there is no model
-    :raises CorruptStateError: if model or statistics are damaged
-    :raises Diverged: if model or statistics are not finite
-    """
-    parameters = RunFolder(start).parameters(run.env_id)
-    saved = SavedModel(parameters.with_name(f"{parameters.name}.zip"), run.algo)
-    saved.load()
-    check_attributes(saved.path, run.algo, read_model(saved.path)[0])
-    if (parameters / VECNORMALIZE).is_file():
-        read_statistics(parameters / VECNORMALIZE)
-
-
-def _statistics_of_run(parameters: Path, settings: Mapping[str, Any]) -> Path | None:
-    """Return the statistics file in a run's folder; None if the run was not normalised.
-
-    :raises ConfigError: if the file is missing though the run was normalised, or the reverse
-    """
-    path = parameters / VECNORMALIZE
-    if settings["normalize"] and not path.is_file():
-        raise ConfigError(
-            f"the run in {parameters.parent} normalised its observations, but {path} is missing; "
-            "give the statistics with --vecnormalize FILE"
-        )
-    if path.is_file() and not settings["normalize"]:
-        raise ConfigError(
-            f"{path} exists, though by {parameters / CONFIG} nothing was normalised; give "
-            f"--vecnormalize {path} to use it, or remove it"
-        )
-    return path if settings["normalize"] else None
-
-
-def _check_lone(path: Path, algo: str) -> None:
-    """Reject a zip outside a run whose observations were, or may have been, normalised.
-
-    :raises ConfigError: explaining which statistics to give
-    """
-    for beside in (path.with_name(VECNORMALIZE), path.with_suffix("") / VECNORMALIZE):
-        if beside.is_file():
-            raise ConfigError(
-                f"{beside} is beside {path}: give --vecnormalize {beside} if it normalised the "
-                "observations of this model, else move it elsewhere"
-            )
-    if issubclass(algorithms()[algo], OnPolicyAlgorithm):
-        data, _ = read_model(path)
-        if differ(*map(data.get, LAST_SEEN[:2])):
-            raise ConfigError(
-                f"{path} was trained with VecNormalize; give its statistics with --vecnormalize "
-                "FILE, even if it normalised only rewards"
-            )
-
-
-def _algo(path: Path, given: str | None, known: str | None) -> str:
-    """Return the algorithm to load a zip with.
-
-    :raises ConfigError: if the given one is unknown, or not the file's
-    """
-    if given is None:
-        return known or algos_of(path)[0]
-    if given not in algorithms():
-        raise ConfigError(f"unknown algorithm {given!r}; allowed are {', '.join(algorithms())}")
-    told = algos_of(path)
-    if given not in told:
-        raise ConfigError(f"{path} is a model of {told[0]}, not of {given}; leave --algo out")
-    return given
-
-
-def algos_of(path: Path) -> list[str]:
-    """Return the algorithms that may have saved a zip, by its policy and attributes.
-
-    There are several where they share a policy class, as TD3 and DDPG do; the first is the
-    likeliest.
-
-    :raises ConfigError: if the zip is not a model, or of an unsupported algorithm
-    """
-    data, _ = read_model(path)
-    policy = data.get("policy_class")
-    found = possible_algorithms(policy, data) if isinstance(policy, type) else []
-    if not found:
-        named = policy.__name__ if isinstance(policy, type) else repr(policy)
-        raise ConfigError(
-            f"{path} has the policy {named}, which belongs to no supported algorithm; allowed are "
-            f"{', '.join(algorithms())}"
-        )
-    return [name.lower() for name in found]

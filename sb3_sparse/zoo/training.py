@@ -32,7 +32,8 @@ from sb3_sparse.zoo.manager import RunManager, spaces_of
 from sb3_sparse.zoo.prepare import prepare, settings_fail, setup_errors
 from sb3_sparse.zoo.record import CURE, Status
 from sb3_sparse.zoo.results import Outcome, final_results
-from sb3_sparse.zoo.saved import EVALUATION_ENVS, check_start
+from sb3_sparse.zoo.resuming import check_start
+from sb3_sparse.zoo.saved import EVALUATION_ENVS
 from sb3_sparse.zoo.settings import Settings
 from sb3_sparse.zoo.spec import RunSpec
 from sb3_sparse.zoo.validation import check_settings

@@ -20,7 +20,7 @@ from sb3_sparse.export.extract import check_model, graph_of
 from sb3_sparse.policies import registry
 from sb3_sparse.policies.registry import CONTRIB, SB3, algorithm_names, registered
 from sb3_sparse.zoo.configs import METHODS, config_path, evaluation_of
-from sb3_sparse.zoo.saved import algos_of
+from sb3_sparse.zoo.saved_by import algos_of
 from sb3_sparse.zoo.spec import algorithms
 
 ROOT = Path(__file__).parents[2]

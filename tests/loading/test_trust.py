@@ -22,7 +22,8 @@ from sb3_sparse import SparseSACPolicy, cli
 from sb3_sparse.errors import ConfigError, CorruptStateError
 from sb3_sparse.loading.zooyaml import NotBuilt, read_zoo_yaml
 from sb3_sparse.zoo.inspection import inspect_model
-from sb3_sparse.zoo.saved import algos_of, check_wrappers
+from sb3_sparse.zoo.saved_by import algos_of
+from sb3_sparse.zoo.wrappers import check_wrappers
 
 
 class Payload:

@@ -22,7 +22,7 @@ from sb3_sparse.errors import CorruptStateError
 from sb3_sparse.export import FORMATS, export_policy
 from sb3_sparse.policies.compiled import plain_names, unwrapped
 from sb3_sparse.zoo.inspection import inspect_model
-from sb3_sparse.zoo.saved import algos_of
+from sb3_sparse.zoo.saved_by import algos_of
 
 pytestmark = pytest.mark.filterwarnings("error:Dynamo")
 """Torch compiles the modules, and never meets the kernels, of which it could only warn."""
