@@ -11,7 +11,7 @@ import torch as th
 from torch import nn
 
 from sb3_sparse.analysis.batches import own_randomness
-from sb3_sparse.engine.linear import MASK_KEY
+from sb3_sparse.engine.layer import MASK_KEY
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.policies.base import BaseSparsePolicy
 from sb3_sparse.policies.compiled import plain_names, unwrapped

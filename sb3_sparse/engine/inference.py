@@ -24,7 +24,8 @@ from sb3_sparse.engine.buffer import FloatBuffer
 from sb3_sparse.engine.chains import watched
 from sb3_sparse.engine.changes import patched
 from sb3_sparse.engine.internals import any_global_hook, watching
-from sb3_sparse.engine.linear import TRIES, SparseLinear
+from sb3_sparse.engine.layer import TRIES
+from sb3_sparse.engine.linear import SparseLinear
 from sb3_sparse.engine.masked import MaskedStorage
 from sb3_sparse.engine.native.library import bits_of, library, readable, why_missing
 from sb3_sparse.engine.paths import Paths, modules_of

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 from sb3_sparse.engine.gradients import GradientMask
-from sb3_sparse.engine.linear import MASK_KEY
+from sb3_sparse.engine.layer import MASK_KEY
 from sb3_sparse.engine.masked_gradients import AccumulatedGradient, FunctionalGradient, follow_mask
 from sb3_sparse.engine.moments import clear_moments, moments_of
 from sb3_sparse.engine.native.library import library, readable, why_missing

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from torch import nn
 
 from sb3_sparse.engine.internals import WRAPPED
-from sb3_sparse.engine.linear import MASK_KEY
+from sb3_sparse.engine.layer import MASK_KEY
 from sb3_sparse.engine.storage import LayerStorage
 from sb3_sparse.errors import UnsupportedError
 

@@ -19,7 +19,7 @@ def make_plain(root: nn.Module) -> None:
         if isinstance(module, ChainedSequential):
             unchain(module)
         elif isinstance(module, SparseLinear):
-            module.to_linear()
+            module.to_dense()
         elif (layer := MaskedStorage.of(module)) is not None:
             layer.remask()
             layer.release()

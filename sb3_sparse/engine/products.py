@@ -17,6 +17,7 @@ from torch.nn import functional
 
 from sb3_sparse.engine.activations import number_of
 from sb3_sparse.engine.internals import is_batched
+from sb3_sparse.engine.layer import dense_weight
 from sb3_sparse.engine.native.library import BatchArgument, LayerArgument, library, readable
 from sb3_sparse.engine.structure import Structure
 from sb3_sparse.errors import UnsupportedError
@@ -194,14 +195,12 @@ class ChainPass(NamedTuple):
         if self.tiled_in:
             x = x.transpose(1, 2).reshape(-1, self.columns)[: self.batch]
         for i, structure in enumerate(self.structures):
-            rows, columns = structure.shape
-            flat = th.from_numpy(structure.flat)
             values = parameters[2 * i]
             if th.onnx.is_in_onnx_export():
                 # The tracer knows the dense weights of the state_dict, not these values.
                 values = values.data
-            weight = values.new_zeros(rows * columns).index_put((flat,), values)
-            x = functional.linear(x, weight.view(rows, columns), parameters[2 * i + 1])
+            weight = dense_weight(structure, values, structure.shape)
+            x = functional.linear(x, weight, parameters[2 * i + 1])
             if (activation := self.activations[i]) is not None:
                 x = activation(x)
         if self.tiled_out:

@@ -144,7 +144,7 @@ class SparseStorage(LayerStorage):
             hook.remove()
         targets = [target.dense() for target in self.targets]
         for module in (self.module, *self.targets):
-            module.to_linear()
+            module.to_dense()
         layer = MaskedStorage(self.name, self.module)
         layer.initial_nnz, layer.final_nnz = self.initial_nnz, self.final_nnz
         layer.set_mask(mask)

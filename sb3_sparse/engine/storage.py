@@ -13,7 +13,7 @@ from torch import nn
 from torch.utils.hooks import RemovableHandle
 
 from sb3_sparse.engine.gradients import GradientMask
-from sb3_sparse.engine.linear import MASK_KEY
+from sb3_sparse.engine.layer import MASK_KEY
 from sb3_sparse.engine.prunable import Prunable, check_plain
 from sb3_sparse.errors import CorruptStateError, TopologyError, UnsupportedError
 from sb3_sparse.topology import Exchange

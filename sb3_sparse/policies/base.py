@@ -14,7 +14,7 @@ from stable_baselines3.common.type_aliases import Schedule
 
 from sb3_sparse.engine.auto import AutoCompute
 from sb3_sparse.engine.controller import Controller
-from sb3_sparse.engine.linear import check_conversion
+from sb3_sparse.engine.layer import check_conversion
 from sb3_sparse.engine.optimizers import check_weight_decay, prefer_fused
 from sb3_sparse.engine.places import check_places
 from sb3_sparse.errors import CorruptStateError, UnsupportedError, check_choice

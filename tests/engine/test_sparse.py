@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import pickle
 from types import SimpleNamespace
 
 import numpy as np
@@ -14,6 +15,7 @@ from stable_baselines3.common.utils import polyak_update
 from torch import nn
 
 from sb3_sparse.engine.internals import replace_data
+from sb3_sparse.engine.layer import Snapshot
 from sb3_sparse.engine.linear import SparseLinear
 from sb3_sparse.engine.masked import MaskedStorage
 from sb3_sparse.engine.sparse import SparseStorage
@@ -261,6 +263,12 @@ def test_copies_are_independent():
     assert (twin.layer.mask() != sparse.layer.mask()).any()
     fresh = twins()[1]
     np.testing.assert_array_equal(sparse.layer.dense(), fresh.layer.dense())
+
+
+def test_pickles_of_earlier_versions_find_their_classes():
+    for name in ("SparseLinear", "Snapshot"):
+        found = pickle.loads(f"csb3_sparse.engine.linear\n{name}\n.".encode())
+        assert found in (SparseLinear, Snapshot)
 
 
 def test_a_parameter_may_change_its_size_while_an_older_graph_is_alive():
