@@ -128,7 +128,7 @@ class Controller:
         return handles
 
     def to_sparse(self, root: nn.Module, names: Container[str] | None = None) -> None:
-        """Move linear layers to sparse storage, in place.
+        """Move layers that can have it to sparse storage, in place.
 
         :param root: the policy, whose ``Sequential`` modules then run them as chains
         :param names: names of the layers; None: all

@@ -64,6 +64,11 @@ class SparseLayer(nn.Module):
     check_mask: Callable[[th.Tensor], None] | None
     """Rejects a saved mask that does not fit the layer's sparsity."""
 
+    @classmethod
+    def takes(cls, module: nn.Module) -> bool:
+        """Whether :meth:`convert` can make this module sparse."""
+        return type(module) is cls.dense_class
+
     @property
     def dense_shape(self) -> tuple[int, ...]:
         """Shape of the dense weight, with as many elements as ``structure.shape``."""
@@ -75,9 +80,9 @@ class SparseLayer(nn.Module):
     ) -> Layer:
         """Make ``module`` sparse, in place; its Parameter stays the same object.
 
-        :param module: a layer of :attr:`dense_class`
+        :param module: a layer that :meth:`takes` is true of
         """
-        assert type(module) is cls.dense_class
+        assert cls.takes(module)
         layer = become(module, cls)
         dense = layer.weight.detach()
         layer.structure = structure
@@ -237,6 +242,9 @@ def dense_weight(structure: Structure, values: th.Tensor, shape: tuple[int, ...]
     """
     rows, columns = structure.shape
     flat = th.from_numpy(structure.flat)
+    if th.onnx.is_in_onnx_export():
+        # The tracer knows the dense weights of the state_dict, not these values.
+        values = values.data
     return values.new_zeros(rows * columns).index_put((flat,), values).view(shape)
 
 

@@ -125,7 +125,7 @@ class SparseNetwork:
     def to_sparse(
         self, names: Container[str] | None, optimizers: Sequence[th.optim.Optimizer]
     ) -> None:
-        """Move linear layers to sparse storage.
+        """Move layers that can have it to sparse storage.
 
         :param names: names of the layers; None: all
         :param optimizers: optimizers whose moments follow

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import nn
 
-from sb3_sparse.engine.linear import SparseLinear
+from sb3_sparse.engine.layer import SparseLayer
 from sb3_sparse.engine.masked import MaskedStorage
 from sb3_sparse.engine.sequential import ChainedSequential, unchain
 
@@ -18,7 +18,7 @@ def make_plain(root: nn.Module) -> None:
     for module in root.modules():
         if isinstance(module, ChainedSequential):
             unchain(module)
-        elif isinstance(module, SparseLinear):
+        elif isinstance(module, SparseLayer):
             module.to_dense()
         elif (layer := MaskedStorage.of(module)) is not None:
             layer.remask()

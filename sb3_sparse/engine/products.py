@@ -195,11 +195,7 @@ class ChainPass(NamedTuple):
         if self.tiled_in:
             x = x.transpose(1, 2).reshape(-1, self.columns)[: self.batch]
         for i, structure in enumerate(self.structures):
-            values = parameters[2 * i]
-            if th.onnx.is_in_onnx_export():
-                # The tracer knows the dense weights of the state_dict, not these values.
-                values = values.data
-            weight = dense_weight(structure, values, structure.shape)
+            weight = dense_weight(structure, parameters[2 * i], structure.shape)
             x = functional.linear(x, weight, parameters[2 * i + 1])
             if (activation := self.activations[i]) is not None:
                 x = activation(x)

@@ -11,6 +11,7 @@ import torch as th
 from numpy.typing import NDArray
 from torch import nn
 
+from sb3_sparse.engine.convolution import SparseConv2d
 from sb3_sparse.engine.gradients import DenseGradient, GradientMask, weakly
 from sb3_sparse.engine.linear import SparseLinear
 from sb3_sparse.engine.masked import MaskedStorage
@@ -19,36 +20,39 @@ from sb3_sparse.engine.storage import LayerStorage
 from sb3_sparse.engine.structure import Structure
 from sb3_sparse.errors import UnsupportedError
 
+SPARSE_TYPES = (SparseLinear, SparseConv2d)
+"""The layers that store their active connections only."""
+
 
 class SparseStorage(LayerStorage):
-    """Keeps a linear layer as the values and indices of its active connections.
+    """Keeps a layer as the values and indices of its active connections.
 
     :param layer: the layer in masked storage, which is released
     :param optimizers: optimizers whose moments of the weight follow
     """
 
     is_sparse = True
-    module: SparseLinear
-    targets: list[SparseLinear]
+    module: SparseLinear | SparseConv2d
+    targets: list[SparseLinear | SparseConv2d]
 
     def __init__(self, layer: MaskedStorage, optimizers: Sequence[th.optim.Optimizer] = ()) -> None:
-        assert isinstance(layer.module, nn.Linear)
+        kind = _sparse_type(layer.module)
+        assert kind is not None
         super().__init__(layer.name, layer.module, layer.shape)
         self.initial_nnz, self.final_nnz = layer.initial_nnz, layer.final_nnz
         self.nnz = layer.nnz
-        structure = Structure.of_mask(layer.mask(), (self.shape[0], self.shape[1]))
+        structure = Structure.of_mask(layer.mask(), (self.shape[0], self.size // self.shape[0]))
         self._structure = structure
         """The structure that targets and moments fit; after a load the module has another."""
         layer.release()
-        self.module = SparseLinear.convert(layer.module, structure, is_target=False)
+        self.module = kind.convert(layer.module, structure, is_target=False)
         self.module.check_mask = self.check_mask
         self.targets = []
         self._hooks = [
             self.module.register_load_state_dict_post_hook(self._after_load)  # type: ignore[no-untyped-call]
         ]
         for target in layer.targets:
-            assert isinstance(target, nn.Linear)
-            self.targets.append(SparseLinear.convert(target, structure, is_target=True))
+            self.targets.append(kind.convert(target, structure, is_target=True))
             hook = target.register_load_state_dict_post_hook(self._after_target_load)  # type: ignore[no-untyped-call]
             self._hooks.append(hook)
         self.settle_moments(optimizers)
@@ -281,8 +285,18 @@ def _followed(
     return th.where(grown, scale * flat[th.from_numpy(after.flat)], moved)
 
 
+def _sparse_type(module: nn.Module) -> type[SparseLinear] | type[SparseConv2d] | None:
+    """The class that a layer becomes in sparse storage; None: it can only be masked."""
+    return next((kind for kind in SPARSE_TYPES if kind.takes(module)), None)
+
+
+def storable(module: nn.Module) -> bool:
+    """Whether a dense layer can have sparse storage: a linear one, or a plain convolution."""
+    return _sparse_type(module) is not None
+
+
 def to_sparse(layer: LayerStorage, optimizers: Sequence[th.optim.Optimizer]) -> LayerStorage:
-    """Move a linear layer to sparse storage; return others, and sparse ones, unchanged."""
-    if isinstance(layer, MaskedStorage) and type(layer.module) is nn.Linear:
+    """Move a layer to sparse storage, if it can have it; return others unchanged."""
+    if isinstance(layer, MaskedStorage) and storable(layer.module):
         return SparseStorage(layer, optimizers)
     return layer

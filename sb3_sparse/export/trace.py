@@ -9,6 +9,7 @@ import numpy as np
 import torch as th
 from torch import nn
 
+from sb3_sparse.engine.convolution import SparseConv2d
 from sb3_sparse.engine.linear import SparseLinear
 from sb3_sparse.engine.sequential import ChainedSequential
 from sb3_sparse.export.activations import nodes_of
@@ -33,7 +34,7 @@ FAR = 10.0
 RENORM = "BatchRenorm"
 """sb3-contrib's normalisation (CrossQ), known by name since it need not be installed."""
 DROPOUTS = (nn.Dropout, nn.Dropout1d, nn.Dropout2d, nn.AlphaDropout, nn.FeatureAlphaDropout)
-OWN_FORWARDS = (SparseLinear.forward, ChainedSequential.forward)
+OWN_FORWARDS = (SparseLinear.forward, SparseConv2d.forward, ChainedSequential.forward)
 """Methods that compute the same as torch's."""
 
 

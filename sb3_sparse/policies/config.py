@@ -42,9 +42,9 @@ class SparsityConfig:
         network that starts dense keeps SB3's initial weights
     :param weight_decay: coefficient of coupled L2 regularisation of the weights, not of biases
     :param mask_seed: seed of masks and growth; None: follows from SB3's ``seed``
-    :param compute: ``"masked"``: dense weights and masks; ``"sparse"``: linear layers store and
-        compute only their active connections; ``"auto"``: large and sparse layers do, by a rule of
-        shapes and counts (docs/compute.md)
+    :param compute: ``"masked"``: dense weights and masks; ``"sparse"``: linear layers and
+        convolutions store and compute only their active connections; ``"auto"``: large and sparse
+        layers do, by a rule of shapes and counts (docs/compute.md)
     :raises ConfigError: for a value that is not allowed
     :raises MissingKernels: for ``compute="sparse"`` without compiled kernels
     """

@@ -1,7 +1,7 @@
-"""Which linear layers may store only their active connections.
+"""Which layers may store only their active connections.
 
 The weight of such a layer is a vector. Code that reads the weight instead of calling the layer, as
-attention and tied layers do, needs the matrix.
+attention and tied layers do, needs the dense weight.
 """
 
 from __future__ import annotations

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.policies import BaseModel
 from torch import nn
 
-from sb3_sparse.engine.linear import SparseLinear
+from sb3_sparse.engine.layer import SparseLayer
 from sb3_sparse.engine.masked import MaskedStorage
 from sb3_sparse.errors import ConfigError, warn
 
@@ -29,7 +30,7 @@ class DenseVectors(BaseModel):
             layer = layers.get(id(parameter))
             if isinstance(layer, MaskedStorage):
                 layer.remask()
-            dense = layer.dense() if isinstance(layer, SparseLinear) else parameter.detach()
+            dense = layer.dense() if isinstance(layer, SparseLayer) else parameter.detach()
             parts.append(dense.reshape(-1).cpu().numpy())
         return np.concatenate(parts)
 
@@ -56,7 +57,7 @@ class DenseVectors(BaseModel):
                 with th.no_grad():
                     parameter.copy_(part.view_as(parameter))
                 continue
-            if isinstance(layer, SparseLinear):
+            if isinstance(layer, SparseLayer):
                 layer.take_saved(part.clone())
                 kept = layer.dense()
             else:
@@ -70,18 +71,18 @@ class DenseVectors(BaseModel):
             )
 
 
-def _layers(root: nn.Module) -> dict[int, SparseLinear | MaskedStorage]:
+def _layers(root: nn.Module) -> dict[int, SparseLayer | MaskedStorage]:
     """The sparse layer that each weight belongs to, by the weight's id."""
-    found: dict[int, SparseLinear | MaskedStorage] = {}
+    found: dict[int, SparseLayer | MaskedStorage] = {}
     for module in root.modules():
-        if isinstance(module, SparseLinear):
+        if isinstance(module, SparseLayer):
             found[id(module.weight)] = module
         elif (layer := MaskedStorage.of(module)) is not None:
             found[id(layer.weight)] = layer
     return found
 
 
-def _size(parameter: nn.Parameter, layer: SparseLinear | MaskedStorage | None) -> int:
-    if isinstance(layer, SparseLinear):
-        return layer.in_features * layer.out_features
+def _size(parameter: nn.Parameter, layer: SparseLayer | MaskedStorage | None) -> int:
+    if isinstance(layer, SparseLayer):
+        return math.prod(layer.dense_shape)
     return parameter.numel()

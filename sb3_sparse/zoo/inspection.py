@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from sb3_sparse.engine.auto import choose
+from sb3_sparse.engine.sparse import storable
 from sb3_sparse.loading.zips import check_state, look_into
 from sb3_sparse.policies.report import SPARSE, SparsityReport
 from sb3_sparse.policies.storage import KNOWN_PACKAGES
@@ -90,8 +91,8 @@ def _sparse(
     :param kwargs: the policy's arguments
     """
     names = {layer.name for layer in outline.layers}
-    if compute == "sparse":
-        return {layer.name for layer in outline.layers if len(layer.shape) == 2}
+    if compute == "sparse":  # as far as shapes tell: not of groups and dilation
+        return {layer.name for layer in outline.layers if storable(layer.module)}
     if compute != "auto" or not _known(policy_class):
         return set()
     if not _known(kwargs.get("features_extractor_class")):

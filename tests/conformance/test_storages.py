@@ -8,13 +8,15 @@ import numpy as np
 import pytest
 import support
 from stable_baselines3.common.callbacks import BaseCallback
-from support import ALGORITHMS, make
+from support import ALGORITHMS, DISCRETE, TinyImages, make
 
 from sb3_sparse import SparsityCallback
 
 METHODS = {"static": {}, "set": {"update_interval": 4}, "rigl": {"update_interval": 4},
            "prune": {"update_interval": 2}, "granet": {"update_interval": 4}}  # fmt: skip
 STEPS = {"PPO": 64, "TRPO": 64, "A2C": 160}
+ON_IMAGES = ("DQN", "PPO", "SAC", "TRPO")
+CASES = [*ALGORITHMS, *(f"{name} on images" for name in ON_IMAGES)]
 STOP = {"TRPO": 33}
 """After one rollout: TRPO draws noise for each stored value, so other numbers follow."""
 
@@ -33,24 +35,34 @@ def storage():
     """Each of these tests has both storages in it, so none is chosen from outside."""
 
 
-def trained(name: str, method: str, compute: str):
+def trained(case: str, method: str, compute: str):
+    """A model after some steps.
+
+    :param case: an algorithm; on images its network has convolutions
+    """
+    name, _, images = case.partition(" on ")
     start = {"initial_sparsity": 0.0} if method in ("prune", "granet") else {}
-    model = make(name, policy_kwargs=dict(compute=compute, sparsity=0.8, **start))
+    kwargs = dict(compute=compute, sparsity=0.8, **start)
+    env = None
+    if images:
+        env = TinyImages(discrete=name in (*DISCRETE, "PPO", "TRPO"))
+        kwargs.update(features_extractor_kwargs=dict(features_dim=16), net_arch=[16])
+    model = make(name, env, policy_kwargs=kwargs)
     callbacks = [StopAt(STOP.get(name, 1000)), SparsityCallback(method, **METHODS[method])]
     return model.learn(STEPS.get(name, 46), callback=callbacks)
 
 
 @pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("name", ALGORITHMS)
-def test_the_same_moves_connection_for_connection_and_the_same_weights(name, method):
-    masked, sparse = (trained(name, method, compute) for compute in ("masked", "sparse"))
+@pytest.mark.parametrize("case", CASES)
+def test_the_same_moves_connection_for_connection_and_the_same_weights(case, method):
+    masked, sparse = (trained(case, method, compute) for compute in ("masked", "sparse"))
     assert all(layer.is_sparse for layer in sparse.policy.sparse.layers)
     ours, theirs = sparse.policy.state_dict(), masked.policy.state_dict()
     assert list(ours) == list(theirs)
     if method != "static":
         assert max(n.mask_updates for n in sparse.policy.sparse.networks) > 0
     # A bias before a BatchRenorm has gradient 0 but for rounding, which Adam makes a whole step of.
-    loose = name == "CrossQ"
+    loose = case == "CrossQ"
     for key, value in theirs.items():
         if key.endswith("weight_mask") or key == "_extra_state":
             np.testing.assert_array_equal(ours[key], value, err_msg=key)
@@ -70,14 +82,14 @@ def test_the_same_moves_connection_for_connection_and_the_same_weights(name, met
 
 
 @pytest.mark.parametrize("saver", ["masked", "sparse"])
-@pytest.mark.parametrize("name", ALGORITHMS)
-def test_what_one_storage_saved_the_other_resumes(name, saver, tmp_path, monkeypatch):
-    model = trained(name, "set", saver)
+@pytest.mark.parametrize("case", CASES)
+def test_what_one_storage_saved_the_other_resumes(case, saver, tmp_path, monkeypatch):
+    model = trained(case, "set", saver)
     model.save(tmp_path / "model")
     other = {"masked": "sparse", "sparse": "masked"}[saver]
     kwargs = {**model.policy_kwargs, "compute": other}
     twins = [
-        ALGORITHMS[name].load(tmp_path / "model", env=model.get_env(), custom_objects=objects)
+        type(model).load(tmp_path / "model", env=model.get_env(), custom_objects=objects)
         for objects in (None, {"policy_kwargs": kwargs})
     ]
     assert [all(layer.is_sparse for layer in t.policy.sparse.layers) for t in twins] == [

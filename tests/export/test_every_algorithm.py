@@ -127,18 +127,32 @@ def test_a_squashed_box_of_two_axes(tmp_path):
 
 
 @pytest.mark.parametrize("to", FORMATS)
+@pytest.mark.parametrize("compute", ["masked", "sparse"])
 @pytest.mark.parametrize("algorithm", ["DQN", "SAC"])
-def test_images(algorithm, to, tmp_path):
-    model = trained(algorithm, TinyImages(algorithm == "DQN"), policy_kwargs={"sparsity": 0.7})
+def test_images(algorithm, compute, to, tmp_path):
+    kwargs = {"sparsity": 0.7, "compute": compute}
+    model = trained(algorithm, TinyImages(algorithm == "DQN"), policy_kwargs=kwargs)
     assert check(model, tmp_path, to).parity.random == 100
 
 
+@pytest.mark.parametrize("int8", [False, True])
+def test_files_are_the_same_whatever_the_storage(int8, tmp_path):
+    model = trained("DQN", TinyImages(), policy_kwargs={"sparsity": 0.7, "compute": "sparse"})
+    export_policy(model, tmp_path / "sparse", int8=int8)
+    model.policy.sparse.to_masked(model.policy)
+    export_policy(model, tmp_path / "masked", int8=int8)
+    one, other = ((tmp_path / f"{name}.c").read_text() for name in ("sparse", "masked"))
+    assert one.replace("sparse", "masked") == other.replace("sparse", "masked")
+
+
+@pytest.mark.parametrize("compute", ["masked", "sparse"])
 @pytest.mark.parametrize("to", ["c", "numpy", "onnx"])
-def test_the_impala_network_with_its_residual_connections(to, tmp_path):
+def test_the_impala_network_with_its_residual_connections(to, compute, tmp_path):
     kwargs = dict(
         features_extractor_class="sb3_sparse.networks.ImpalaCNN",
         features_extractor_kwargs=dict(channels=(4, 8, 8), features_dim=32),
         sparsity=0.6,
+        compute=compute,
     )
     check(make("PPO", TinyImages(False), policy_kwargs=kwargs), tmp_path, to)
 

@@ -156,7 +156,9 @@ NARROW = {
         ("PPO", "TinyImages-v0", {"share_features_extractor": False}),
         ("SAC", "TinyImages-v0", {"share_features_extractor": True}),
         ("DQN", "TinyImages-v0", {}),
+        ("DQN", "TinyImages-v0", {"compute": "sparse"}),
         ("DQN", "TinyImages-v0", IMPALA),
+        ("DQN", "TinyImages-v0", {**IMPALA, "compute": "sparse"}),
         ("DQN", "TinyImages-v0", NARROW),
     ],
 )

@@ -7,7 +7,7 @@ import onnx
 import onnxruntime
 import pytest
 import torch as th
-from support import ALGORITHMS, make
+from support import ALGORITHMS, TinyImages, make
 from torch import nn
 
 BATCHES = (1, 5, 70)  # tiles hold 64
@@ -29,19 +29,23 @@ def activation(request):
     return request.param
 
 
-@pytest.fixture(params=["SAC", "TD3", "DQN", "PPO", "CrossQ"])
+@pytest.fixture(params=["SAC", "TD3", "DQN", "PPO", "CrossQ", "DQN on images", "SAC on images"])
 def network(request, activation):
+    name, _, images = request.param.partition(" on ")
     kwargs = dict(compute="sparse", activation_fn=activation)
-    policy = make(ALGORITHMS[request.param], policy_kwargs=kwargs).policy
-    assert any(layer.is_sparse for layer in policy.sparse.layers)
+    env = TinyImages(discrete=name == "DQN") if images else None
+    policy = make(ALGORITHMS[name], env, policy_kwargs=kwargs).policy
+    assert all(layer.is_sparse for layer in policy.sparse.layers)
     acting = getattr(policy, "actor", None) or getattr(policy, "q_net", None) or policy
-    direct = request.param in ("TD3", "DQN")
+    direct = name in ("TD3", "DQN")
     return (acting if direct else Deterministic(acting)).eval()
 
 
 def seen(network, batch):
-    inputs = next(m for m in network.modules() if isinstance(m, nn.Linear)).in_features
-    return th.as_tensor(np.random.default_rng(batch).normal(size=(batch, inputs)), dtype=th.float32)
+    first = next(m for m in network.modules() if isinstance(m, (nn.Linear, nn.Conv2d)))
+    shape = (first.in_features,) if isinstance(first, nn.Linear) else (1, 36, 36)
+    noise = np.random.default_rng(batch).normal(size=(batch, *shape))
+    return th.as_tensor(noise, dtype=th.float32)
 
 
 def tensors(result):
