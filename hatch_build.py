@@ -57,7 +57,9 @@ def compile_kernels(source: Path, library: Path, extra: tuple[str, ...] = ()) ->
         variants.update(avx2=AVX2, avx512=AVX512)
     with tempfile.TemporaryDirectory(dir=library.parent) as folder:
         objects = []
-        for (suffix, flags), name in product(variants.items(), ("kernels", "act", "fused")):
+        for (suffix, flags), name in product(
+            variants.items(), ("kernels", "act", "fused", "images")
+        ):
             objects.append(str(Path(folder, f"{name}_{suffix}.o")))
             subprocess.run(
                 [*command, *FLAGS, *flags, *extra, f"-DSUFFIX={suffix}", "-c",

@@ -18,10 +18,8 @@ PLAIN = (th.Tensor, th.nn.Parameter)
 
 
 class Link(Protocol):
-    """The view of a linear layer that a chain has."""
+    """The view of a sparse layer that a chain has."""
 
-    in_features: int
-    out_features: int
     bias: Any
 
     def live(self) -> tuple[Structure, th.Tensor]:
@@ -29,6 +27,13 @@ class Link(Protocol):
 
     def held(self) -> tuple[Structure, th.Tensor]:
         """As :meth:`live`, without a graph and while another thread may move connections."""
+
+
+class LinearLink(Link, Protocol):
+    """The view of a linear layer that a chain has."""
+
+    in_features: int
+    out_features: int
 
 
 class Chain:
@@ -39,7 +44,9 @@ class Chain:
         no activation
     """
 
-    def __init__(self, layers: Sequence[Link], activations: Sequence[nn.Module | None]) -> None:
+    def __init__(
+        self, layers: Sequence[LinearLink], activations: Sequence[nn.Module | None]
+    ) -> None:
         self.layers = list(layers)
         self.activations = list(activations)
         self.columns = self.layers[0].in_features

@@ -52,6 +52,11 @@ def watching() -> bool:
     )
 
 
+def use_count(tensor: th.Tensor) -> int:
+    """Count what refers to a tensor's memory: tensors, and graphs that saved one of them."""
+    return int(th._C._storage_Use_Count(tensor.untyped_storage()._cdata))
+
+
 def is_batched(gradient: th.Tensor) -> bool:
     """Whether a gradient is several at once, as in ``is_grads_batched`` and ``torch.func``."""
     kinds = th._C._functorch

@@ -67,6 +67,11 @@ class ChainPass(NamedTuple):
     def rows(self) -> int:
         return self.structures[-1].shape[0]
 
+    @property
+    def keeps_result(self) -> bool:
+        """Whether the backward pass reads the result: a tiled one that an activation made."""
+        return self.tiled_out and self.activations[-1] is not None
+
     def _arguments(self, parameters: Sequence[Any], outputs: Sequence[int]) -> Any:
         """An array of ``layer_t``, without the gradients.
 
@@ -136,8 +141,9 @@ class ChainPass(NamedTuple):
         :param work: activations as :meth:`forward` left them
         :param needs: whether the gradient of the input and of each parameter is needed
         :param grad: gradient of the result
-        :param arguments: a copy of the array of ``layer_t``; this sets its gradient addresses
+        :param arguments: the array of ``layer_t`` that :meth:`forward` made
         """
+        arguments = type(arguments).from_buffer_copy(arguments)
         needs_x, *needed = needs
         grads = [
             th.empty_like(parameter) if need and parameter is not None else None
@@ -212,9 +218,9 @@ class Products(th.autograd.Function):
     def forward(ctx: Any, how: ChainPass, x: th.Tensor, *parameters: Any) -> th.Tensor:
         y, work, arguments = how.forward(x, parameters)
         ctx.how, ctx.arguments = how, arguments
-        # The backward pass reads a tiled result where an activation made it. Where none did, an
-        # activation that works in place may change it.
-        kept = y if how.tiled_out and how.activations[-1] is not None else None
+        # Where the backward pass does not read the result, an activation that works in place may
+        # change it.
+        kept = y if how.keeps_result else None
         ctx.save_for_backward(x, work, kept, *parameters)
         return y
 
@@ -240,8 +246,7 @@ class Products(th.autograd.Function):
             tensors = zip((x, *parameters), needs, strict=True)
             return None, *(th.zeros_like(tensor) if need else None for tensor, need in tensors)
         grad = gradients[0].contiguous().resolve_neg()
-        arguments = type(ctx.arguments).from_buffer_copy(ctx.arguments)
-        return None, *how.backward(x, work, parameters, needs, grad, arguments)
+        return None, *how.backward(x, work, parameters, needs, grad, ctx.arguments)
 
 
 def _outer(output_grad: th.Tensor, x: th.Tensor, batch: int) -> th.Tensor:

@@ -10,17 +10,20 @@ from torch import nn
 
 from sb3_sparse.engine.activations import ACTIVATIONS, ADJUSTABLE, tells_its_slope
 from sb3_sparse.engine.chains import Chain, watched
+from sb3_sparse.engine.image_steps import has_convolution, plan
+from sb3_sparse.engine.images import ImageChain
 from sb3_sparse.engine.inference import by_modules
 from sb3_sparse.engine.internals import MODULE_HOOKS, any_global_hook, become
 from sb3_sparse.engine.kept import KeptInference
 from sb3_sparse.engine.linear import SparseLinear
+from sb3_sparse.engine.paths import modules_of
 
 ELEMENTWISE = (*ACTIVATIONS, nn.Identity)
 """Activations that work on tiles unchanged."""
 
 
 class ChainedSequential(nn.Sequential):
-    """A ``Sequential`` that runs its sparse layers as chains.
+    """A ``Sequential`` that runs its sparse layers, also those of residual blocks, as chains.
 
     With hooks on its modules, and under tracing, it calls the modules one by one, as torch does.
     """
@@ -40,14 +43,16 @@ class ChainedSequential(nn.Sequential):
             results = self._inferred(input)
             if results is not None:
                 return results[0]
-        modules = tuple(self._modules.values())
-        hooked = any(getattr(module, hooks) for module in modules for hooks in MODULE_HOOKS)
-        hooked = hooked or any("forward" in vars(module) for module in modules)
+        modules = called = tuple(self._modules.values())
+        if any(module._modules for module in modules):  # residual blocks
+            called = tuple(modules_of([modules]))
+        hooked = any(getattr(module, hooks) for module in called for hooks in MODULE_HOOKS)
+        hooked = hooked or any("forward" in vars(module) for module in called)
         if hooked or watched(input) or any_global_hook():
             y: th.Tensor = super().forward(input)  # type: ignore[no-untyped-call]
             return y
-        if modules != self._seen or not all(map(tells_its_slope, self._adjustable)):
-            self._seen, self._steps = modules, _steps(modules)
+        if called != self._seen or not all(map(tells_its_slope, self._adjustable)):
+            self._seen, self._steps = called, _steps(modules)
             fused = (
                 after for step, *_ in self._steps for after in getattr(step, "activations", ())
             )
@@ -72,7 +77,16 @@ class ChainedSequential(nn.Sequential):
 def _steps(modules: Sequence[Any]) -> list[tuple[Any, bool, bool]]:
     """Group modules into chains and others; tell whether a chain's input and output are tiles."""
     groups: list[Any] = []
-    for module in modules:
+    position = 0
+    while position < len(modules):
+        module = modules[position]
+        if has_convolution(module):
+            steps, layers, count = plan(modules[position:])
+            if steps:
+                groups.append(ImageChain(steps, layers))
+                position += count
+                continue
+        position += 1
         last = groups[-1] if groups else None
         if isinstance(module, SparseLinear):
             if isinstance(last, list):
@@ -102,7 +116,9 @@ def chain_up(root: nn.Module) -> None:
     for module in root.modules():
         if type(module) not in (nn.Sequential, ChainedSequential):
             continue
-        if any(isinstance(child, SparseLinear) for child in module.children()):
+        if any(
+            isinstance(child, SparseLinear) or has_convolution(child) for child in module.children()
+        ):
             become(module, ChainedSequential)
             # More layers may be sparse now.
             vars(module).update(_seen=(), _steps=[], _adjustable=[], _kept=KeptInference())

@@ -9,24 +9,22 @@ from gymnasium import spaces
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
+from sb3_sparse.engine.residual import Residual
 from sb3_sparse.networks.images import check_images, flat_size
 
 
-class ResidualBlock(nn.Module):
+class ResidualBlock(Residual):
     """Computes ``x + conv(relu(conv(relu(x))))`` with 3×3 convolutions that keep the size."""
 
+    name = "layers"
+
     def __init__(self, channels: int) -> None:
-        super().__init__()
-        self.layers = nn.Sequential(
+        super().__init__(
             nn.ReLU(),  # not in place: x is added below
             nn.Conv2d(channels, channels, kernel_size=3, padding=1),
             nn.ReLU(),
             nn.Conv2d(channels, channels, kernel_size=3, padding=1),
         )
-
-    def forward(self, x: th.Tensor) -> th.Tensor:
-        out: th.Tensor = x + self.layers(x)
-        return out
 
 
 def stack(inputs: int, outputs: int) -> list[nn.Module]:

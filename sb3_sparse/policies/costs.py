@@ -15,10 +15,10 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
 from sb3_sparse.engine.prunable import PRUNABLE_TYPES
-from sb3_sparse.engine.residual import Residual
+from sb3_sparse.networks.simba import SimbaBlock
 from sb3_sparse.policies.internals import space_of
 
-PATHS = (nn.Sequential, Residual)
+PATHS = (nn.Sequential, SimbaBlock)
 """Modules that compute one after another what they hold."""
 NORM_FLOPS = 5
 """FLOPs for each unit of a LayerNorm without scale and shift.
@@ -34,7 +34,7 @@ def flops_per_unit(module: nn.Module) -> int | None:
     An activation function counts 1, and so does the sum of a SimBa block. A LayerNorm counts
     :data:`NORM_FLOPS`, and 1 each for its scale and its shift.
     """
-    if type(module).__module__ == "torch.nn.modules.activation" or isinstance(module, Residual):
+    if type(module).__module__ == "torch.nn.modules.activation" or isinstance(module, SimbaBlock):
         return 1
     if isinstance(module, nn.LayerNorm):
         return NORM_FLOPS + sum(one is not None for one in (module.weight, module.bias))

@@ -1,5 +1,6 @@
 /* Chooses the kernels for the processor at run time. */
 #include "fused.h"
+#include "images.h"
 
 #include <math.h>
 #include <pthread.h>
@@ -9,11 +10,14 @@
 #if defined(__x86_64__)
 DECLARE(avx512)
 DECLARE_FUSED(avx512)
+DECLARE_IMAGES(avx512)
 DECLARE(avx2)
 DECLARE_FUSED(avx2)
+DECLARE_IMAGES(avx2)
 #endif
 DECLARE(plain)
 DECLARE_FUSED(plain)
+DECLARE_IMAGES(plain)
 
 typedef struct {
     const char *name;
@@ -21,10 +25,13 @@ typedef struct {
     int (*backward)(const layer_t *, const batch_t *);
     int (*act)(const step_t *, int64_t, int64_t, int, const void *, float *);
     int64_t (*fused)(const program_t *, int64_t, int64_t);
+    int (*images_forward)(const images_t *, const map_t *, const image_step_t *);
+    int (*images_backward)(const images_t *, const map_t *, const image_step_t *);
 } kernels_t;
 
 #define ENTRY(name, suffix)                                                                  \
-    {name, NAMED(forward, suffix), NAMED(backward, suffix), NAMED(act, suffix), NAMED(fused, suffix)}
+    {name, NAMED(forward, suffix), NAMED(backward, suffix), NAMED(act, suffix),    \
+     NAMED(fused, suffix), NAMED(images_forward, suffix), NAMED(images_backward, suffix)}
 
 /* The best first. What is plain on aarch64 is NEON, which every such processor has. */
 static const kernels_t all[] = {
@@ -57,7 +64,7 @@ static int runs_here(const kernels_t *kernels) {
 #define EXPORT __attribute__((visibility("default")))
 
 /* Changes with every change of what Python hands over. */
-EXPORT int sb3_sparse_version(void) { return 10; }
+EXPORT int sb3_sparse_version(void) { return 11; }
 
 openmp_t sb3_sparse_openmp;
 
@@ -126,6 +133,16 @@ EXPORT int sb3_sparse_act(const step_t *steps, int64_t count, int64_t batch, int
 /* Operations first..last of a program; the number of the check that failed, or -1. */
 EXPORT int64_t sb3_sparse_fused(const program_t *program, int64_t first, int64_t last) {
     return chosen->fused(program, first, last);
+}
+
+/* -1 if there is no memory for it, else 0. */
+EXPORT int sb3_sparse_images_forward(const images_t *images, const map_t *maps, const image_step_t *steps) {
+    return chosen->images_forward(images, maps, steps);
+}
+
+/* -1 if there is no memory for it, else 0. */
+EXPORT int sb3_sparse_images_backward(const images_t *images, const map_t *maps, const image_step_t *steps) {
+    return chosen->images_backward(images, maps, steps);
 }
 
 /* Sets inactive weights to 0, except NaN and infinities, which become NaN and stay visible. */

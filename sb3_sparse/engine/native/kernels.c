@@ -1,5 +1,6 @@
 #include "activations.h"
 #include "products.h"
+#include "threads.h"
 
 #include <stdlib.h>
 
@@ -36,7 +37,8 @@ static void slope_tile(const layer_t *layer, int64_t vectors, const float *y, fl
         slope(layer->activation, (float)layer->a, (float)layer->b, y + r * TILE, g + r * TILE, count);
 }
 
-static void forward_share(share_t *share) {
+static void forward_share(void *argument) {
+    share_t *share = argument;
     const batch_t *batch = share->batch;
     const layer_t *layers = share->layers, *last = layers + batch->layers - 1;
     for (int64_t t = share->first; t < share->last; t++) {
@@ -56,7 +58,8 @@ static void forward_share(share_t *share) {
     }
 }
 
-static void backward_share(share_t *share) {
+static void backward_share(void *argument) {
+    share_t *share = argument;
     const batch_t *batch = share->batch;
     const layer_t *layers = share->layers, *top = layers + batch->layers - 1;
     int64_t first = share->first, last = share->last;
@@ -105,31 +108,8 @@ static void backward_share(share_t *share) {
                   TILE, batch->rows_input_grad + t * TILE * layers->columns);
 }
 
-typedef struct {
-    void (*work)(share_t *);
-    share_t *shares;
-    int64_t count;
-} job_t;
-
-static void take_shares(void *argument) {
-    const job_t *job = argument;
-    for (int64_t i = sb3_sparse_openmp.thread(); i < job->count; i += sb3_sparse_openmp.threads())
-        job->work(job->shares + i);
-}
-
-static void run(void (*work)(share_t *), share_t *shares, int64_t count) {
-    job_t job = {work, shares, count};
-    if (count > 1 && sb3_sparse_openmp.parallel)
-        sb3_sparse_openmp.parallel(take_shares, &job, (unsigned)count, 0);
-    else
-        for (int64_t i = 0; i < count; i++) work(shares + i);
-}
-
 static int64_t split(const layer_t *layers, const batch_t *batch, share_t *shares) {
-    int64_t tiles = (batch->batch + TILE - 1) / TILE, count = batch->threads;
-    if (count > tiles) count = tiles;
-    if (count > 64) count = 64;
-    if (count < 1) count = 1;
+    int64_t tiles = (batch->batch + TILE - 1) / TILE, count = shares_of(tiles, batch->threads);
     for (int64_t i = 0; i < count; i++)
         shares[i] = (share_t){.layers = layers, .batch = batch, .first = tiles * i / count,
                               .last = tiles * (i + 1) / count};
@@ -137,12 +117,12 @@ static int64_t split(const layer_t *layers, const batch_t *batch, share_t *share
 }
 
 void NAMED(forward, SUFFIX)(const layer_t *layers, const batch_t *batch) {
-    share_t shares[64];
-    run(forward_share, shares, split(layers, batch, shares));
+    share_t shares[MOST_SHARES];
+    run_shares(forward_share, shares, sizeof *shares, split(layers, batch, shares));
 }
 
 int NAMED(backward, SUFFIX)(const layer_t *layers, const batch_t *batch) {
-    share_t shares[64];
+    share_t shares[MOST_SHARES];
     int64_t count = split(layers, batch, shares), n = batch->layers;
     int64_t tiles = (batch->batch + TILE - 1) / TILE, widest = 0, values = 0, grads = 0;
     for (int64_t l = 0; l < n; l++) {
@@ -187,7 +167,7 @@ int NAMED(backward, SUFFIX)(const layer_t *layers, const batch_t *batch) {
             next += i ? layer->rows : 0;
         }
     }
-    run(backward_share, shares, count);
+    run_shares(backward_share, shares, sizeof *shares, count);
     for (int64_t i = 1; i < count; i++)
         for (int64_t l = 0; l < n; l++) {
             const layer_t *layer = layers + l;

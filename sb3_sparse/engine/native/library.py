@@ -13,7 +13,7 @@ import torch as th
 from sb3_sparse.errors import ConfigError, MissingKernels
 
 PATH = Path(__file__).with_name("kernels.so")
-VERSION = 10
+VERSION = 11
 """Version of the interface; ``dispatch.c`` has the same number."""
 
 
@@ -39,6 +39,34 @@ class BatchArgument(ctypes.Structure):
     _fields_ = [
         *_integers("layers batch threads input rows_in rows_out"),
         *_integers("rows_grad tiles_grad rows_input_grad tiles_input_grad"),
+    ]
+
+
+class MapArgument(ctypes.Structure):
+    """``map_t`` of ``images.h``."""
+
+    _fields_ = _integers("channels height width kept at grad_at")
+
+
+class ImageStepArgument(ctypes.Structure):
+    """``image_step_t`` of ``images.h``."""
+
+    _fields_ = [
+        *_integers("kind input source output add copy gate adds slope"),
+        *_integers("kernel_y kernel_x stride_y stride_x padding_y padding_x taken activation"),
+        ("a", ctypes.c_double),
+        ("b", ctypes.c_double),
+        *_integers("row_start column column_start row position value bias"),
+        *_integers("value_grad bias_grad output_grad"),
+    ]
+
+
+class ImagesArgument(ctypes.Structure):
+    """``images_t`` of ``images.h``."""
+
+    _fields_ = [
+        *_integers("steps maps batch threads ring grad_ring kept_size scratch_size kept"),
+        *_integers("images_in images_out images_out_grad images_in_grad"),
     ]
 
 

@@ -1,0 +1,124 @@
+"""Splits modules into the steps that the kernels compute on images."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from math import prod
+from typing import NamedTuple
+
+from torch import nn
+
+from sb3_sparse.engine.activations import tells_its_slope
+from sb3_sparse.engine.convolution import SparseConv2d
+from sb3_sparse.engine.image_layout import ImageStep, Window
+from sb3_sparse.engine.paths import is_residual, is_sequence
+
+
+class _Enter(NamedTuple):
+    """Marks the begin of a residual block."""
+
+
+class _Leave(NamedTuple):
+    """Marks its end."""
+
+
+Token = nn.Module | _Enter | _Leave
+
+
+def has_convolution(module: nn.Module) -> bool:
+    """Whether a module is a sparse convolution, or a residual block or ``Sequential`` with one."""
+    if is_residual(module) or is_sequence(module):
+        return any(map(has_convolution, module.children()))
+    return type(module) is SparseConv2d
+
+
+def plan(modules: Sequence[nn.Module]) -> tuple[list[ImageStep], list[SparseConv2d], int]:
+    """Plan the steps of as many modules as possible, from the first one on.
+
+    :param modules: modules in the order in which they are called
+    :return: the steps, their convolutions, and the number of modules that they stand for; none if
+        there is no convolution in sparse storage among them
+    """
+    for count in range(len(modules), 0, -1):
+        tokens = _tokens(modules[:count])
+        steps = None if tokens is None else _steps(tokens)
+        if tokens and steps:
+            layers = [token for token in tokens if isinstance(token, SparseConv2d)]
+            if layers:
+                return steps, layers, count
+    return [], [], 0
+
+
+def _is_pool(module: nn.Module) -> bool:
+    return (
+        type(module) is nn.MaxPool2d
+        and module.dilation in (1, (1, 1))
+        and not module.ceil_mode
+        and not module.return_indices
+        and prod(Window.of(module).kernel) <= 128  # the kernels number them by bytes
+    )
+
+
+def _tokens(modules: Iterable[nn.Module]) -> list[Token] | None:
+    """Flatten modules; None if one is not computed by the kernels."""
+    found: list[Token] = []
+    for module in modules:
+        if is_sequence(module) or is_residual(module):
+            inner = _tokens(module.children())
+            if inner is None:
+                return None
+            found += [_Enter(), *inner, _Leave()] if is_residual(module) else inner
+        elif type(module) is SparseConv2d or _is_pool(module) or tells_its_slope(module):
+            found.append(module)
+        elif type(module) is not nn.Identity:
+            return None
+    return found
+
+
+def _steps(tokens: Sequence[Token]) -> list[ImageStep] | None:
+    """Turn modules into steps; None where they do not fit together in a way that is computed."""
+    steps: list[ImageStep] = []
+    now = source = maps = 0
+    held: list[int] = []  # inputs of the blocks that are open
+    for token in tokens:
+        last = steps[-1] if steps else None
+        if isinstance(token, _Enter):
+            if now != source:
+                return None
+            held.append(now)
+        elif isinstance(token, _Leave):
+            add = held.pop()
+            if (
+                last is None
+                or now == add
+                or now != source
+                or last.activation
+                or last.add is not None
+            ):
+                return None
+            if last.weight is None:
+                return None
+            steps[-1] = last._replace(add=add)
+        elif isinstance(token, SparseConv2d | nn.MaxPool2d):
+            if now != source and not isinstance(token, SparseConv2d):
+                return None
+            maps += 1
+            weight = token.dense_shape if isinstance(token, SparseConv2d) else None
+            steps.append(ImageStep(Window.of(token), weight, None, now, source, maps))
+            now = source = maps
+        elif last is None or now != source or last.output != now:
+            return None
+        elif (
+            last.weight is not None
+            and last.activation is None
+            and last.add is None
+            and now not in held
+        ):
+            steps[-1] = last._replace(activation=token)
+        elif type(token) is nn.ReLU and last.copy is None:
+            maps += 1
+            steps[-1] = last._replace(copy=maps)
+            now = maps
+        else:
+            return None
+    return steps if now == source and not held else None
