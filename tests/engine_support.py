@@ -11,7 +11,7 @@ import numpy as np
 import torch as th
 from torch import nn
 
-from sb3_sparse.engine.linear import SparseLinear
+from sb3_sparse.engine.sparse import SPARSE_TYPES
 from sb3_sparse.engine.structure import Structure
 
 MOVES = 10000
@@ -20,8 +20,9 @@ MOVES = 10000
 def largest_while_moving(
     shape: tuple[int, int],
     densities: tuple[float, float],
-    actor_of: Callable[[nn.Linear], Callable[[], th.Tensor]],
+    actor_of: Callable[[nn.Module], Callable[[], th.Tensor]],
     threads: int,
+    layer: nn.Module | None = None,
 ) -> tuple[list[Any], set[float]]:
     """The largest outputs for inputs of 1, and what they may be: each mask's own.
 
@@ -29,12 +30,14 @@ def largest_while_moving(
     thread stands among the outputs.
 
     :param actor_of: makes, of the layer, what the threads call
+    :param layer: of as many inputs and outputs; None: a linear layer
     """
     random = np.random.default_rng(0)
-    layer = nn.Linear(shape[1], shape[0])
+    layer = nn.Linear(shape[1], shape[0]) if layer is None else layer
     masks = [random.random(shape) < density for density in densities]
     structures = [Structure.of_mask(mask, mask.shape) for mask in masks]
-    SparseLinear.convert(layer, structures[0], is_target=False)
+    (kind,) = (kind for kind in SPARSE_TYPES if kind.takes(layer))
+    kind.convert(layer, structures[0], is_target=False)
     layer.bias.data.zero_()
     layer.restructure(structures[0], th.full((structures[0].nnz,), 0.5))
     act, found, done = actor_of(layer), [], threading.Event()

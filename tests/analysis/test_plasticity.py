@@ -102,10 +102,15 @@ def test_units_of_simba_networks_are_those_within_the_blocks():
 def test_other_algorithms_work_and_images_have_channels_as_units(name):
     model = make(name)
     model.learn(40, callback=PlasticityCallback(10))
-    images = make("DQN", "TinyImages-v0", policy_kwargs={"net_arch": []})
-    shape = (2, *images.observation_space.shape)
-    units = activity(images, np.ones(shape, np.uint8))["q_net"].activations
-    assert [len(layer) for layer in units] == [32, 64, 64, 512]
+    found = []
+    for compute in ("masked", "sparse"):
+        kwargs = {"net_arch": [], "compute": compute}
+        images = make("DQN", "TinyImages-v0", policy_kwargs=kwargs)
+        shape = (2, *images.observation_space.shape)
+        found.append(activity(images, np.ones(shape, np.uint8))["q_net"].activations)
+    assert [len(layer) for layer in found[0]] == [32, 64, 64, 512]
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-6)
 
 
 def test_what_has_no_units_says_so():

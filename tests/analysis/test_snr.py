@@ -170,9 +170,10 @@ def test_training_is_the_same_with_and_without(name, package, compute, tmp_path)
         assert th.equal(value, ends[1][key]), key
 
 
+@pytest.mark.parametrize("compute", ["masked", "sparse"])
 @pytest.mark.parametrize("name", ["DQN", "PPO"])
-def test_images_and_shared_features_work(name):
-    kwargs = {"features_extractor_kwargs": {"features_dim": 8}, "net_arch": [8]}
+def test_images_and_shared_features_work(name, compute):
+    kwargs = {"features_extractor_kwargs": {"features_dim": 8}, "net_arch": [8], "compute": compute}
     model = make(name, "TinyImages-v0", policy_kwargs=kwargs)
     model.learn(40)
     for network in gradient_snr(model).networks:

@@ -189,15 +189,16 @@ def test_it_acts_when_gradient_steps_pass_a_multiple_and_at_the_end():
     assert acted == [10, 20, 30]
 
 
+@pytest.mark.parametrize("compute", ["masked", "sparse"])
 @pytest.mark.parametrize("env", [TinyImages, TinyDicts])
-def test_channels_are_units_and_what_reads_them_through_other_modules_is_found(env):
+def test_channels_are_units_and_what_reads_them_through_other_modules_is_found(env, compute):
     policy = {TinyImages: "SparseCnnPolicy", TinyDicts: "SparseMultiInputPolicy"}[env]
     model = stable_baselines3.SAC(
         policy,
         env(discrete=False),
         buffer_size=50,
         learning_starts=5,
-        policy_kwargs={"sparsity": 0.8, "net_arch": [16]},
+        policy_kwargs={"sparsity": 0.8, "net_arch": [16], "compute": compute},
     )
     model.learn(10, callback=RecycleDormantCallback(2, tau=0.5, batch_size=8))
     assert_masked(model)

@@ -188,14 +188,16 @@ def test_noisy_optimizers_leave_what_is_inactive_at_zero():
     assert inactive(model) == 0.0
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_vectors_are_dense_in_every_storage(name, storage):
-    model = make(name)
+@pytest.mark.parametrize(
+    ("name", "env"), [*((name, None) for name in NAMES), ("DQN", "TinyImages-v0")]
+)
+def test_vectors_are_dense_in_every_storage(name, env, storage):
+    model = make(name, env)
     vector = model.policy.parameters_to_vector()
-    dense = make(name, policy="MlpPolicy")
+    dense = make(name, env, policy="CnnPolicy" if env else "MlpPolicy")
     assert vector.shape == dense.policy.parameters_to_vector().shape
     other = {"masked": "sparse", "sparse": "masked"}[storage]
-    twin = make(name, policy_kwargs=dict(compute=other), seed=1)
+    twin = make(name, env, policy_kwargs=dict(compute=other), seed=1)
     twin.policy.load_state_dict(model.policy.state_dict())
     twin.policy.load_from_vector(2 * vector)
     np.testing.assert_array_equal(twin.policy.parameters_to_vector(), 2 * vector)

@@ -12,10 +12,12 @@ from sb3_sparse import SparsityCallback
 
 
 @pytest.mark.parametrize("method", ["static", "rigl"])
-@pytest.mark.parametrize("algorithm", sorted(ALGORITHMS))
-def test_a_trained_model_is_freed(algorithm, method):
+@pytest.mark.parametrize(
+    ("algorithm", "env"), [*((name, None) for name in sorted(ALGORITHMS)), ("DQN", "TinyImages-v0")]
+)
+def test_a_trained_model_is_freed(algorithm, env, method):
     def train_and_forget():
-        model = make(algorithm)
+        model = make(algorithm, env)
         options = {} if method == "static" else {"update_interval": 5}
         model.learn(100, callback=SparsityCallback(method, **options))
         return [weakref.ref(thing) for thing in (model, model.policy, model.get_env())]

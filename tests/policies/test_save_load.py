@@ -89,19 +89,24 @@ def test_a_saved_policy_comes_back_as_it_was(name, tmp_path):
     np.testing.assert_array_equal(ours, theirs)
 
 
+@pytest.mark.parametrize("compute", ["masked", "sparse"])
 @pytest.mark.parametrize("name", ["SAC", "PPO", "TD3"])
-def test_a_saved_policy_with_a_shared_extractor_comes_back(name, tmp_path):
+def test_a_saved_policy_with_a_shared_extractor_comes_back(name, compute, tmp_path):
     import gymnasium as gym
 
     kwargs = dict(
         share_features_extractor=name != "PPO",
         features_extractor_kwargs=dict(features_dim=8),
         net_arch=[8],
+        compute=compute,
     )
     model = make(name, gym.make("TinyImages-v0", discrete=False), policy_kwargs=kwargs)
     model.policy.save(tmp_path / "policy.pth")
     loaded = type(model.policy).load(tmp_path / "policy.pth", device="cpu")
     assert loaded.share_features_extractor == kwargs["share_features_extractor"]
+    assert {layer.is_sparse for layer in loaded.sparse.layers} == {compute == "sparse"}
+    for key, value in model.policy.state_dict().items():
+        np.testing.assert_array_equal(loaded.state_dict()[key], value, err_msg=key)
 
 
 @pytest.mark.parametrize(
