@@ -30,6 +30,8 @@ FLAGS = [
     "-Wall",
     "-Wextra",
 ]
+SOURCES = ("kernels", "act", "fused", "images", "one_image")
+"""Files that are compiled once for each instruction set."""
 AVX2 = ["-mavx2", "-mfma"]
 AVX512 = [*AVX2, "-mavx512f", "-mavx512dq", "-mavx512vl", "-mavx512bw"]
 
@@ -57,9 +59,7 @@ def compile_kernels(source: Path, library: Path, extra: tuple[str, ...] = ()) ->
         variants.update(avx2=AVX2, avx512=AVX512)
     with tempfile.TemporaryDirectory(dir=library.parent) as folder:
         objects = []
-        for (suffix, flags), name in product(
-            variants.items(), ("kernels", "act", "fused", "images")
-        ):
+        for (suffix, flags), name in product(variants.items(), SOURCES):
             objects.append(str(Path(folder, f"{name}_{suffix}.o")))
             subprocess.run(
                 [*command, *FLAGS, *flags, *extra, f"-DSUFFIX={suffix}", "-c",

@@ -15,7 +15,7 @@ from torch.nn.grad import conv2d_weight
 
 from sb3_sparse.engine.activations import number_of
 from sb3_sparse.engine.chains import Link, watched
-from sb3_sparse.engine.image_layout import LANES, ImageStep, Layout, lay_out
+from sb3_sparse.engine.image_layout import LANES, ImageStep, Layout, Shape, lay_out
 from sb3_sparse.engine.layer import dense_weight
 from sb3_sparse.engine.native.library import (
     ImagesArgument,
@@ -30,15 +30,57 @@ from sb3_sparse.engine.structure import Structure
 from sb3_sparse.errors import UnsupportedError
 
 _empty = partial(th.empty, dtype=th.float32, device="cpu")
-FEW = 8
-"""Up to so many images are computed one by one where no gradient follows."""
+FEW = 4
+"""Up to so many images are computed one by one where no backward pass follows."""
+
+
+class Call(NamedTuple):
+    """What the kernels take of a chain for images of one size.
+
+    :param layout: of the maps in memory
+    :param maps: an array of ``map_t``
+    :param arguments: an array of ``image_step_t``, without addresses
+    """
+
+    layout: Layout
+    maps: Any
+    arguments: Any
+
+
+def prepare(steps: Sequence[ImageStep], shape: Shape, keep: bool) -> Call | None:
+    """Prepare calls for images of a shape; None if the shape does not fit the steps.
+
+    :param keep: whether a backward pass may follow
+    """
+    layout = lay_out(steps, shape, keep)
+    if layout is None:
+        return None
+    maps = [MapArgument(*m.shape, m.kept, m.at, _or_none(m.grad_at)) for m in layout.maps]
+    arguments = [
+        ImageStepArgument(
+            step.weight is None,
+            step.input, step.source, step.output, _or_none(step.add), _or_none(step.copy),
+            _or_none(back.gate), back.adds, back.slope,
+            *chain.from_iterable(step.window), taken, *number_of(step.activation),
+        )
+        for step, taken, back in zip(steps, layout.taken, layout.backward, strict=True)
+    ]  # fmt: skip
+    return Call(
+        layout,
+        (MapArgument * len(maps))(*maps),
+        (ImageStepArgument * len(arguments))(*arguments),
+    )
+
+
+def _or_none(number: int | None) -> int:
+    return -1 if number is None else number
 
 
 class ImagePass(NamedTuple):
     """One forward pass of a batch through a chain, and the backward pass if there is one.
 
     :param steps: the steps
-    :param layout: of the maps in memory
+    :param call: what the kernels take for images of this size
     :param structures: connections of each convolution
     :param layers: weak references to the convolutions
     :param batch: images of the batch
@@ -46,7 +88,7 @@ class ImagePass(NamedTuple):
     """
 
     steps: Sequence[ImageStep]
-    layout: Layout
+    call: Call
     structures: list[Structure]
     layers: list[Any]
     batch: int
@@ -59,12 +101,13 @@ class ImagePass(NamedTuple):
 
     def forward(self, x: th.Tensor, parameters: Sequence[Any]) -> tuple[th.Tensor, th.Tensor, Any]:
         """Compute the result, all that the backward pass reads, and nothing else."""
-        layout = self.layout
+        layout = self.call.layout
         y = _empty(self.batch, *layout.maps[self.steps[-1].output].shape)
         kept = self.memory(-(-self.batch // LANES) * layout.kept_size)
         images = self._images(layout.forward_size, kept, images_in=x.data_ptr())
         images.images_out = y.data_ptr()
-        self._run("forward", images, self._arguments(parameters))
+        alone = not layout.kept_size and self.batch <= FEW
+        self._run("one_by_one" if alone else "forward", images, self._arguments(parameters))
         return y, kept, None
 
     def backward(
@@ -100,11 +143,11 @@ class ImagePass(NamedTuple):
             argument.value_grad = value_grad.data_ptr()
             listener = None if (module := self.layers[n]()) is None else module.listener
             if listener is not None and listener.wanted():
-                output_grad = _empty(self.batch, *self.layout.maps[step.output].shape)
+                output_grad = _empty(self.batch, *self.call.layout.maps[step.output].shape)
                 argument.output_grad = output_grad.data_ptr()
                 listening.append((step, listener, output_grad))
         grad_x = th.empty_like(x) if needs_x else None
-        images = self._images(self.layout.backward_size, kept, images_out_grad=grad.data_ptr())
+        images = self._images(self.call.layout.backward_size, kept, images_out_grad=grad.data_ptr())
         images.images_in_grad = 0 if grad_x is None else grad_x.data_ptr()
         self._run("backward", images, arguments)
         for step, listener, output_grad in listening:
@@ -116,7 +159,7 @@ class ImagePass(NamedTuple):
         return by_dense_weights(self.steps, self.structures, x, parameters)
 
     def _images(self, scratch: int, kept: th.Tensor, **addresses: int) -> Any:
-        layout = self.layout
+        layout = self.call.layout
         return ImagesArgument(
             steps=len(self.steps),
             maps=len(layout.maps),
@@ -131,62 +174,46 @@ class ImagePass(NamedTuple):
         )
 
     def _run(self, name: str, images: Any, arguments: Any) -> None:
-        maps = [
-            MapArgument(*m.shape, m.kept, m.at, -1 if m.grad_at is None else m.grad_at)
-            for m in self.layout.maps
-        ]
         run = getattr(library(), f"sb3_sparse_images_{name}")
-        if run(ctypes.byref(images), (MapArgument * len(maps))(*maps), arguments):
+        if run(ctypes.byref(images), self.call.maps, arguments):
             raise MemoryError(f"no memory for the {name} pass of a chain of sparse convolutions")
 
     def _arguments(self, parameters: Sequence[Any]) -> Any:
         """An array of ``image_step_t``, without gradients."""
+        arguments = type(self.call.arguments).from_buffer_copy(self.call.arguments)
         convolutions = zip(self.structures, parameters[::2], parameters[1::2], strict=True)
-        arguments = []
-        layout = self.layout
-        for step, taken, back in zip(self.steps, layout.taken, layout.backward, strict=True):
-            argument = ImageStepArgument(
-                step.weight is None,
-                step.input, step.source, step.output, _or_none(step.add), _or_none(step.copy),
-                _or_none(back.gate), back.adds, back.slope,
-                *chain.from_iterable(step.window), taken, *number_of(step.activation),
-            )  # fmt: skip
-            if step.weight is not None:
-                structure, values, bias = next(convolutions)
-                for parameter in (values, bias):
-                    if parameter is not None and not readable(parameter):
-                        raise UnsupportedError(
-                            "weights and biases of layers in sparse storage must be contiguous "
-                            f"float32 on the CPU, got {parameter.dtype} on {parameter.device} "
-                            f"with strides {parameter.stride()}"
-                        )
-                if values.numel() != structure.nnz:
-                    raise RuntimeError("a layer's connections have changed while it was computing")
-                names = ("row_start", "column", "column_start", "row", "position")
-                for name, address in zip(names, structure.addresses, strict=True):
-                    setattr(argument, name, address)
-                argument.value = values.data_ptr()
-                argument.bias = 0 if bias is None else bias.data_ptr()
-            arguments.append(argument)
-        return (ImageStepArgument * len(arguments))(*arguments)
+        for step, argument in zip(self.steps, arguments, strict=True):
+            if step.weight is None:
+                continue
+            structure, values, bias = next(convolutions)
+            for parameter in (values, bias):
+                if parameter is not None and not readable(parameter):
+                    raise UnsupportedError(
+                        "weights and biases of layers in sparse storage must be contiguous float32 "
+                        f"on the CPU, got {parameter.dtype} on {parameter.device} with strides "
+                        f"{parameter.stride()}"
+                    )
+            if values.numel() != structure.nnz:
+                raise RuntimeError("a layer's connections have changed while it was computing")
+            argument.row_start, argument.column, *by_columns = structure.addresses
+            argument.column_start, argument.row, argument.position = by_columns
+            argument.value = values.data_ptr()
+            argument.bias = 0 if bias is None else bias.data_ptr()
+        return arguments
 
     def _outer(self, kept: th.Tensor, step: ImageStep, output_grad: th.Tensor) -> th.Tensor:
         """Compute a convolution's dense gradient from its kept input and its output's gradient."""
-        shape, _, at, _ = self.layout.maps[step.input]
+        shape, _, at, _ = self.call.layout.maps[step.input]
         channels, height, width = shape
-        ring = self.layout.ring
+        ring = self.call.layout.ring
         size = channels * (height + 2 * ring) * (width + 2 * ring) * LANES
-        tiles = kept.view(-1, self.layout.kept_size)[:, at : at + size]
+        tiles = kept.view(-1, self.call.layout.kept_size)[:, at : at + size]
         x = tiles.view(-1, channels, height + 2 * ring, width + 2 * ring, LANES)
         x = x[:, :, ring : ring + height, ring : ring + width]
         x = x.permute(0, 4, 1, 2, 3).reshape(-1, *shape)[: self.batch]
         assert step.weight is not None
         grad: th.Tensor = conv2d_weight(x, step.weight, output_grad, *step.window[1:])  # type: ignore[no-untyped-call]
         return grad
-
-
-def _or_none(number: int | None) -> int:
-    return -1 if number is None else number
 
 
 def by_dense_weights(
@@ -227,7 +254,7 @@ class ImageChain:
         self._layers = list(layers)
         # As for chains of linear layers: a graph must not hold the layers.
         self._references = [ref(layer) for layer in self._layers]
-        self._layout = cache(partial(lay_out, self.steps))
+        self._call = cache(partial(prepare, self.steps))
         self._memory = ReusedMemory()
 
     def __call__(self, x: th.Tensor) -> th.Tensor:
@@ -256,10 +283,10 @@ class ImageChain:
         trains = th.is_grad_enabled() and (
             x.requires_grad or any(p is not None and p.requires_grad for p in parameters)
         )
-        layout = self._layout(tuple(x.shape[1:]), trains) if x.dim() == 4 else None
-        if seen or layout is None:  # where sizes do not fit, torch says so
+        call = self._call(tuple(x.shape[1:]), trains) if x.dim() == 4 else None
+        if seen or call is None:  # where sizes do not fit, torch says so
             return by_dense_weights(self.steps, structures, x, parameters)
-        how = ImagePass(self.steps, layout, structures, self._references, len(x), self._memory)
+        how = ImagePass(self.steps, call, structures, self._references, len(x), self._memory)
         x = x.contiguous().resolve_neg()
         if trains:
             y: th.Tensor = Products.apply(how, x, *parameters)  # type: ignore[no-untyped-call]

@@ -26,12 +26,14 @@ typedef struct {
     int (*act)(const step_t *, int64_t, int64_t, int, const void *, float *);
     int64_t (*fused)(const program_t *, int64_t, int64_t);
     int (*images_forward)(const images_t *, const map_t *, const image_step_t *);
+    int (*images_one_by_one)(const images_t *, const map_t *, const image_step_t *);
     int (*images_backward)(const images_t *, const map_t *, const image_step_t *);
 } kernels_t;
 
 #define ENTRY(name, suffix)                                                                  \
     {name, NAMED(forward, suffix), NAMED(backward, suffix), NAMED(act, suffix),    \
-     NAMED(fused, suffix), NAMED(images_forward, suffix), NAMED(images_backward, suffix)}
+     NAMED(fused, suffix), NAMED(images_forward, suffix), \
+     NAMED(images_one_by_one, suffix), NAMED(images_backward, suffix)}
 
 /* The best first. What is plain on aarch64 is NEON, which every such processor has. */
 static const kernels_t all[] = {
@@ -64,7 +66,7 @@ static int runs_here(const kernels_t *kernels) {
 #define EXPORT __attribute__((visibility("default")))
 
 /* Changes with every change of what Python hands over. */
-EXPORT int sb3_sparse_version(void) { return 11; }
+EXPORT int sb3_sparse_version(void) { return 12; }
 
 openmp_t sb3_sparse_openmp;
 
@@ -138,6 +140,11 @@ EXPORT int64_t sb3_sparse_fused(const program_t *program, int64_t first, int64_t
 /* -1 if there is no memory for it, else 0. */
 EXPORT int sb3_sparse_images_forward(const images_t *images, const map_t *maps, const image_step_t *steps) {
     return chosen->images_forward(images, maps, steps);
+}
+
+/* The same for a few images, where no backward pass follows. */
+EXPORT int sb3_sparse_images_one_by_one(const images_t *images, const map_t *maps, const image_step_t *steps) {
+    return chosen->images_one_by_one(images, maps, steps);
 }
 
 /* -1 if there is no memory for it, else 0. */

@@ -1,18 +1,12 @@
 /* Passes of a batch through a chain of convolutions and poolings, forth and back. */
 #include "activations.h"
 #include "convolution.h"
+#include "maps.h"
 #include "threads.h"
 
 #include <stdlib.h>
 
 #define DOTS_PLACES 64 /* places of an output that a round of dot products covers, about */
-
-/* A map of one tile in memory: where its first number within the ring is, and the distances of rows and
-   channels. */
-typedef struct {
-    float *at;
-    int64_t row, channel;
-} plane_t;
 
 /* One thread's share of a batch: the tiles [first, last). */
 typedef struct {
@@ -30,17 +24,6 @@ static int64_t entries_of(const images_t *images, int64_t tile) {
     return left < LANES ? left : LANES;
 }
 
-static int64_t size_of(const map_t *map, int64_t ring) {
-    return map->channels * (map->height + 2 * ring) * (map->width + 2 * ring) * LANES;
-}
-
-static plane_t plane_of(const map_t *map, float *base, int64_t ring) {
-    plane_t plane = {base, (map->width + 2 * ring) * LANES, 0};
-    plane.channel = (map->height + 2 * ring) * plane.row;
-    plane.at += ring * (plane.row + LANES);
-    return plane;
-}
-
 static float *memory_of(const share_t *share, const map_t *map, int64_t tile) {
     return map->kept ? share->images->kept + tile * share->images->kept_size + map->at
                      : share->scratch + map->at;
@@ -48,28 +31,12 @@ static float *memory_of(const share_t *share, const map_t *map, int64_t tile) {
 
 static plane_t map_of(const share_t *share, int64_t number, int64_t tile) {
     const map_t *map = share->maps + number;
-    return plane_of(map, memory_of(share, map, tile), share->images->ring);
+    return plane_of(map, memory_of(share, map, tile), share->images->ring, LANES);
 }
 
 static plane_t grad_of(const share_t *share, int64_t number) {
     const map_t *map = share->maps + number;
-    return plane_of(map, share->scratch + map->grad_at, share->images->grad_ring);
-}
-
-static void clear_ring(const map_t *map, float *base, int64_t ring) {
-    int64_t row = (map->width + 2 * ring) * LANES, side = ring * LANES;
-    for (int64_t c = 0; c < map->channels && ring; c++) {
-        memset(base, 0, (ring * row + side) * sizeof *base);
-        base += ring * row + side;
-        for (int64_t y = 0; y < map->height - 1; y++) {
-            base += map->width * LANES;
-            memset(base, 0, 2 * side * sizeof *base);
-            base += 2 * side;
-        }
-        base += map->width * LANES;
-        memset(base, 0, (ring * row + side) * sizeof *base);
-        base += ring * row + side;
-    }
+    return plane_of(map, share->scratch + map->grad_at, share->images->grad_ring, LANES);
 }
 
 /* Images [batch, channels, height, width] to and from a tile's map; lanes without an image are 0. */
@@ -147,7 +114,7 @@ static void pool(const share_t *share, const image_step_t *step, int64_t tile) {
 /* A map that is about to be written: its ring is 0. */
 static plane_t begin(const share_t *share, int64_t number, int64_t tile) {
     const map_t *map = share->maps + number;
-    clear_ring(map, memory_of(share, map, tile), share->images->ring);
+    clear_ring(map, memory_of(share, map, tile), share->images->ring, LANES);
     return map_of(share, number, tile);
 }
 
@@ -214,11 +181,11 @@ static void dots(const image_step_t *step, const map_t *out, taps_t taps, plane_
 
 static void sums(const map_t *out, plane_t g, float *grad, int add) {
     for (int64_t o = 0; o < out->channels; o++) {
-        vec sum = {0};
+        vec sum[4] = {{0}}; /* of neighbours, whose sums do not wait for each other */
         for (int64_t i = 0; i < out->height; i++)
-            for (int64_t j = 0; j < out->width * LANES; j += WIDTH)
-                sum += LOAD(g.at + o * g.channel + i * g.row + j);
-        grad[o] = (add ? grad[o] : 0) + total(sum);
+            for (int64_t j = 0, q = 0; j < out->width * LANES; j += WIDTH, q = (q + 1) & 3)
+                sum[q] += LOAD(g.at + o * g.channel + i * g.row + j);
+        grad[o] = (add ? grad[o] : 0) + total((sum[0] + sum[1]) + (sum[2] + sum[3]));
     }
 }
 
@@ -230,7 +197,7 @@ static void convolve_back(const share_t *share, const image_step_t *step, taps_t
     const map_t *in = share->maps + step->source;
     plane_t g = grad_of(share, step->out), to = grad_of(share, step->source), gate = g;
     if (step->gate >= 0) gate = map_of(share, step->gate, tile);
-    if (!step->adds) clear_ring(in, share->scratch + in->grad_at, share->images->grad_ring);
+    if (!step->adds) clear_ring(in, share->scratch + in->grad_at, share->images->grad_ring, LANES);
     for (int64_t a = 0; a < step->stride_y; a++)
         for (int64_t b = 0; b < step->stride_x; b++) {
             int64_t y0 = modulo(a - step->padding_y, step->stride_y);
@@ -259,7 +226,7 @@ static void pool_back(const share_t *share, const image_step_t *step, int64_t ti
     const int8_t *taken =
         (const int8_t *)(share->images->kept + tile * share->images->kept_size + step->taken);
     if (!step->adds)
-        memset(share->scratch + in->grad_at, 0, size_of(in, share->images->grad_ring) * sizeof(float));
+        memset(share->scratch + in->grad_at, 0, size_of(in, share->images->grad_ring, LANES) * sizeof(float));
     for (int64_t c = 0; c < out->channels; c++)
         for (int64_t i = 0; i < out->height; i++)
             for (int64_t j = 0; j < out->width; j++) {
@@ -291,7 +258,7 @@ static void backward_share(void *argument) {
     int64_t result = last->channels * last->height * last->width * LANES;
     for (int64_t t = share->first; t < share->last; t++) {
         int64_t entries = entries_of(images, t), add = t > share->first;
-        clear_ring(last, share->scratch + last->grad_at, images->grad_ring);
+        clear_ring(last, share->scratch + last->grad_at, images->grad_ring, LANES);
         take_images(last, grad_of(share, last - share->maps), images->images_out_grad + t * result, entries);
         for (int64_t n = images->steps - 1; n >= 0; n--) {
             const image_step_t *step = share->steps + n;
@@ -303,7 +270,7 @@ static void backward_share(void *argument) {
             plane_t g = grad_of(share, step->out), y = map_of(share, step->out, t);
             if (step->add >= 0 && share->maps[step->add].grad_at != out->grad_at)
                 memcpy(share->scratch + share->maps[step->add].grad_at, share->scratch + out->grad_at,
-                       size_of(out, images->grad_ring) * sizeof(float));
+                       size_of(out, images->grad_ring, LANES) * sizeof(float));
             for (int64_t row = 0; row < out->channels * out->height && step->slope; row++) {
                 int64_t c = row / out->height, i = row % out->height;
                 slope(step->activation, (float)step->a, (float)step->b,
@@ -332,7 +299,7 @@ static int64_t nnz_of(const image_step_t *step, const map_t *maps) {
 /* Offsets of a convolution's connections in its input; returns the memory behind them. */
 static int32_t *set_taps(const share_t *share, const image_step_t *step, taps_t *taps, int32_t *memory) {
     const map_t *in = share->maps + step->in;
-    plane_t x = plane_of(in, 0, share->images->ring);
+    plane_t x = plane_of(in, 0, share->images->ring, LANES);
     int64_t nnz = nnz_of(step, share->maps), tap = 0;
     int32_t *offset = memory, *of_tap = memory + nnz;
     for (int64_t c = 0; c < in->channels; c++)
@@ -347,7 +314,7 @@ static int32_t *set_taps(const share_t *share, const image_step_t *step, taps_t 
 /* The same from the input's side, in the gradient of the output: by phases of the stride, then by channels. */
 static int32_t *set_turned(const share_t *share, const image_step_t *step, taps_t *turned, int32_t *memory) {
     const map_t *in = share->maps + step->in;
-    plane_t g = plane_of(share->maps + step->out, 0, share->images->grad_ring);
+    plane_t g = plane_of(share->maps + step->out, 0, share->images->grad_ring, LANES);
     int64_t nnz = nnz_of(step, share->maps), k = 0;
     int32_t *offset = memory, *start = memory + nnz, *next = start;
     float *value = (float *)(start + in->channels * step->stride_y * step->stride_x + 1);

@@ -57,6 +57,7 @@ typedef struct {
 
 #define DECLARE_IMAGES(suffix)                                                              \
     int NAMED(images_forward, suffix)(const images_t *, const map_t *, const image_step_t *); \
+    int NAMED(images_one_by_one, suffix)(const images_t *, const map_t *, const image_step_t *); \
     int NAMED(images_backward, suffix)(const images_t *, const map_t *, const image_step_t *);
 
 #endif
