@@ -12,13 +12,15 @@ within it the choice of the action (``predict`` off policy, ``forward`` on polic
 appended to a CSV file immediately.
 
 A case is ``ALGORITHM-NETWORK`` or ``ALGORITHM-NETWORK@ENVIRONMENT``. The network is the width of
-two layers, or ``nature`` or ``impala`` for images of noise. Hyperparameters are SB3's defaults,
-except that ``dqn`` takes a gradient step of 128 samples at every step of the environment; ``dqn4``
-takes one of 32 samples at every fourth, which is SB3's default.
+two layers, or ``nature`` or ``impala`` for images: of noise, or of an Atari game in SB3's
+``AtariWrapper``, four frames to an observation. Hyperparameters are SB3's defaults, except that
+``dqn`` takes a gradient step of 128 samples at every step of the environment; ``dqn4`` takes one of
+32 samples at every fourth, which is SB3's default.
 
     python benchmarks/end_to_end.py                                   # three quarters of an hour
     python benchmarks/end_to_end.py --cases sac-256,ppo-64@CartPole-v1 --sparsity 0,0.9,0.95
     python benchmarks/end_to_end.py --cases sac-128 --activation elu --method rigl
+    python benchmarks/end_to_end.py --cases dqn4-nature@PongNoFrameskip-v4 --sparsity 0.95
     python benchmarks/end_to_end.py --sbx sbx/bin/python              # SBX too
     python benchmarks/end_to_end.py --grid --csv grid.csv             # never slower? Hours
     python benchmarks/end_to_end.py --table end_to_end.csv            # as Markdown
@@ -41,27 +43,11 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+from end_to_end_cases import CASES, parsed
 from learner import ACTIVATIONS, ALGORITHMS, IMAGES, SPARSE, Worker
 from rounds import appending, in_turn, listed
 
 SBX = 'python -m venv sbx && sbx/bin/pip install sbx-rl "gymnasium[mujoco]"'
-CARTPOLE = "CartPole-v1"
-CASES: dict[str, list[float]] = {
-    "sac-256": [0.0, 0.9, 0.95],
-    "sac-1024": [0.9, 0.95],
-    "td3-256": [0.0, 0.9],
-    "tqc-256": [0.9],
-    "dqn-512": [0.0, 0.9],
-    "dqn4-512": [0.9],
-    "ppo-64": [0.0, 0.9],
-    "ppo-256": [0.9],
-    f"ppo-64@{CARTPOLE}": [0.9],
-    f"ppo-256@{CARTPOLE}": [0.9],
-    "a2c-64": [0.0, 0.9],
-    "dqn4-nature": [0.0, 0.9],
-    "dqn4-impala": [0.0, 0.9],
-}
-"""Sparsities of each case."""
 GRID_WIDTHS = (32, 64, 128, 256, 512, 1024)
 GRID_SPARSITIES = [0.0, 0.5, 0.8, 0.9, 0.95, 0.99]
 FIELDS = [
@@ -69,28 +55,6 @@ FIELDS = [
     *("steps_per_second", "lowest", "highest", "ratio", "ratio_lowest", "ratio_highest"),
     *("rollout_us", "rollout_ratio", "act_us", "act_ratio", "core_share"),
 ]
-
-
-def parsed(case: str) -> tuple[str, str, str]:
-    """Split a case into algorithm, network and environment.
-
-    :raises ValueError: if it is not a case
-    """
-    name, _, env = case.partition("@")
-    algo, _, net = name.partition("-")
-    if algo not in ALGORITHMS:
-        raise ValueError(f"case {case!r}: the algorithm is one of {', '.join(ALGORITHMS)}")
-    discrete = "dqn" in algo
-    if net in IMAGES:
-        if env:
-            raise ValueError(f"case {case!r}: {net} takes images of noise, so name no environment")
-        if not discrete and ALGORITHMS[algo][0] not in ("PPO", "A2C"):
-            raise ValueError(f"case {case!r}: image networks go with DQN, QRDQN, PPO and A2C")
-        return algo, net, "noise"
-    if not net.isdecimal() or int(net) == 0:
-        nets = ", ".join(sorted(IMAGES))
-        raise ValueError(f"case {case!r}: the network is a width, such as 256, or one of {nets}")
-    return algo, net, env or (CARTPOLE if discrete else "HalfCheetah-v5")
 
 
 def measure(

@@ -41,8 +41,9 @@ ALGORITHMS: dict[str, tuple[str, dict[str, Any]]] = {
 """Class and settings of each algorithm; everything else is SB3's default, but ``dqn`` and ``qrdqn``
 train at every step of the environment."""
 IMAGES = {"nature", "impala"}
-"""Networks for images, from an environment of noise."""
-
+"""Networks for images."""
+NOISE = "noise"
+"""Environment whose images are noise."""
 
 MODULES = {
     "stock": ["stable_baselines3", "sb3_contrib"],
@@ -91,6 +92,33 @@ def network(kind: str, net: str, activation: str | None) -> dict[str, Any]:
     return found
 
 
+def is_atari(env: str) -> bool:
+    """Whether it is the name of an Atari game that skips no frames, as SB3's wrapper does."""
+    return "NoFrameskip" in env
+
+
+def environment(env: str) -> Any:
+    """Make an environment, or give its name where SB3 can make it.
+
+    :raises SystemExit: if there are no Atari games here
+    """
+    if env == NOISE:
+        from gymnasium import spaces
+
+        return RandomEnv(IMAGE, spaces.Discrete(6))
+    if not is_atari(env):
+        return env
+    try:
+        importlib.import_module("ale_py")  # registers the games
+        importlib.import_module("cv2")
+    except ModuleNotFoundError as error:
+        raise SystemExit(f"{env} needs {error.name}: pip install ale-py opencv-python") from None
+    from stable_baselines3.common.env_util import make_atari_env
+    from stable_baselines3.common.vec_env import VecFrameStack
+
+    return VecFrameStack(make_atari_env(env, seed=0), n_stack=4)
+
+
 def build(spec: dict[str, Any]) -> Any:
     """Make an untrained model; None if the contender has none of this kind."""
     kind, net = spec["kind"], spec["net"]
@@ -111,9 +139,7 @@ def build(spec: dict[str, Any]) -> Any:
         settings["buffer_size"] = 2000  # 56 kB each
     if name == "PPO":
         settings["n_steps"] = spec["rollout"]
-    from gymnasium import spaces
-
-    env = RandomEnv(IMAGE, spaces.Discrete(6)) if images else spec["env"]
+    env = environment(spec["env"])
     return made(policy, env, policy_kwargs=kwargs, seed=0, device="cpu", **settings)
 
 

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from stable_baselines3.common.atari_wrappers import AtariWrapper
 
 BENCHMARKS = Path(__file__).parent.parent.parent / "benchmarks"
 
@@ -157,6 +158,26 @@ def test_a_case_names_algorithm_network_and_environment(end_to_end):
     assert end_to_end.parsed("dqn4-64") == ("dqn4", "64", "CartPole-v1")
     assert end_to_end.parsed("ppo-64@CartPole-v1") == ("ppo", "64", "CartPole-v1")
     assert end_to_end.parsed("ppo-impala") == ("ppo", "impala", "noise")
+    pong = "PongNoFrameskip-v4"
+    assert end_to_end.parsed(f"dqn4-nature@{pong}") == ("dqn4", "nature", pong)
+
+
+def test_an_atari_game_is_seen_as_four_grey_frames(end_to_end):
+    pytest.importorskip("ale_py")
+    import learner
+
+    game = learner.environment("PongNoFrameskip-v4")
+    assert game.reset().shape == (1, 84, 84, 4)
+    assert game.env_is_wrapped(AtariWrapper) == [True]
+    game.close()
+
+
+def test_atari_without_its_emulator_is_rejected_with_a_recipe(end_to_end, monkeypatch):
+    import learner
+
+    monkeypatch.setitem(sys.modules, "ale_py", None)
+    with pytest.raises(SystemExit, match="needs ale_py: pip install ale-py opencv-python"):
+        learner.environment("PongNoFrameskip-v4")
 
 
 @pytest.mark.parametrize(
@@ -165,7 +186,7 @@ def test_a_case_names_algorithm_network_and_environment(end_to_end):
         (["--cases", "sack-256"], "the algorithm is one of sac, td3"),
         (["--cases", "sac-wide"], "the network is a width, such as 256, or one of impala, nature"),
         (["--cases", "sac-nature"], "image networks go with DQN"),
-        (["--cases", "dqn-nature@CartPole-v1"], "name no environment"),
+        (["--cases", "dqn-nature@CartPole-v1"], "or of an Atari game, such as PongNoFrameskip-v4"),
         (["--sparsity", "0.9,1"], "from 0 to below 1, got 1.0"),
         (["--sparsity", "most"], "separated by commas, got 'most'"),
         (["--activation", "relu,gelu"], "one of relu, tanh, elu, silu; got gelu"),
