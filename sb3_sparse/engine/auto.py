@@ -1,9 +1,11 @@
-"""The rule of ``compute="auto"``: which linear layers get sparse storage.
+"""The rule of ``compute="auto"``: which layers get sparse storage.
 
 The rule goes by shapes, counts and the kernels' instruction set, so equal seeds give equal runs on
-a machine. A chain of layers with nothing but activations between them is one decision, because
-changing between rows and tiles costs most where it happens. The whole chain becomes sparse if one
-of its layers is large and sparse enough (docs/compute.md has the measurements).
+a machine. A chain of layers is one decision, because changing between two layouts of the batch
+costs most where it happens. Linear layers with nothing but activations between them are a chain; it
+becomes sparse if one of its layers is large and sparse enough. Convolutions with activations,
+poolings and residual sums between them are one, too; it becomes sparse if all of its layers
+together are sparse enough (docs/compute.md has the measurements).
 """
 
 from __future__ import annotations
@@ -13,8 +15,11 @@ from collections.abc import Container, Iterable, Sequence
 import torch as th
 from torch import nn
 
+from sb3_sparse.engine.convolution import SparseConv2d
+from sb3_sparse.engine.image_steps import in_order, is_between
 from sb3_sparse.engine.native.library import in_use, why_missing
 from sb3_sparse.engine.optimizers import acts_elementwise
+from sb3_sparse.engine.paths import is_sequence
 from sb3_sparse.engine.sequential import ELEMENTWISE
 from sb3_sparse.engine.storage import LayerStorage
 
@@ -72,12 +77,14 @@ def choose(root: nn.Module, layers: Iterable[LayerStorage], allowed: Container[s
     """
     if why_missing() is not None:
         return []
-    return [
-        layer.name
-        for chain in chains_of(root, (layer for layer in layers if layer.name in allowed))
+    layers = [layer for layer in layers if layer.name in allowed]
+    linear = [
+        chain
+        for chain in chains_of(root, layers)
         if any(enough_for_chain(layer.size, layer.nnz) for layer in chain)
-        for layer in chain
     ]
+    images = [chain for chain in image_chains_of(root, layers) if enough_for_images(chain)]
+    return [layer.name for chain in linear + images for layer in chain]
 
 
 def enough_for_chain(size: int, nnz: int) -> bool:
@@ -87,6 +94,12 @@ def enough_for_chain(size: int, nnz: int) -> bool:
     :param nnz: active connections
     """
     return size >= LARGE and sparse_enough(size, nnz)
+
+
+def enough_for_images(chain: Sequence[LayerStorage]) -> bool:
+    """Whether convolutions gain by computing with their active connections only."""
+    share = 2 if in_use() in WITH_VECTORS else 4
+    return share * sum(layer.nnz for layer in chain) <= sum(layer.size for layer in chain)
 
 
 def sparse_enough(size: int, nnz: int) -> bool:
@@ -120,3 +133,32 @@ def chains_of(root: nn.Module, layers: Iterable[LayerStorage]) -> list[list[Laye
         if chain:
             chains.append(chain)
     return chains + [[layer] for key, layer in linear.items() if key not in seen]
+
+
+def image_chains_of(root: nn.Module, layers: Iterable[LayerStorage]) -> list[list[LayerStorage]]:
+    """Group convolutions that follow each other with nothing between them but what kernels compute.
+
+    Convolutions that the kernels do not compute are left out.
+    """
+    convolutions = {
+        id(layer.module): layer
+        for layer in layers
+        if SparseConv2d.takes(layer.module) or isinstance(layer.module, SparseConv2d)
+    }
+    chains: list[list[LayerStorage]] = []
+    seen: set[int] = set()
+    for sequence in root.modules():
+        if not is_sequence(sequence):
+            continue
+        chain: list[LayerStorage] = []
+        for module in in_order(sequence):
+            layer = convolutions.get(id(module))
+            if layer is not None and id(module) not in seen:
+                seen.add(id(module))
+                chain.append(layer)
+            elif not is_between(module) and chain:
+                chains.append(chain)
+                chain = []
+        if chain:
+            chains.append(chain)
+    return chains + [[layer] for key, layer in convolutions.items() if key not in seen]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from math import prod
 from typing import NamedTuple
 
@@ -57,6 +57,20 @@ def _is_pool(module: nn.Module) -> bool:
         and not module.return_indices
         and prod(Window.of(module).kernel) <= 128  # the kernels number them by bytes
     )
+
+
+def is_between(module: nn.Module) -> bool:
+    """Whether the kernels compute a module between two convolutions."""
+    return _is_pool(module) or tells_its_slope(module) or type(module) is nn.Identity
+
+
+def in_order(module: nn.Module) -> Iterator[nn.Module]:
+    """Go through what a ``Sequential`` or a residual block calls, in that order."""
+    for child in module.children():
+        if is_sequence(child) or is_residual(child):
+            yield from in_order(child)
+        else:
+            yield child
 
 
 def _tokens(modules: Iterable[nn.Module]) -> list[Token] | None:
