@@ -12,8 +12,10 @@ from torch import nn
 
 from sb3_sparse.engine.masked import MaskedStorage
 from sb3_sparse.engine.prunable import Prunable
+from sb3_sparse.engine.residual import Residual
 from sb3_sparse.engine.storage import LayerStorage
 from sb3_sparse.errors import ConfigError, CorruptStateError
+from sb3_sparse.networks.impala import ResidualBlock
 from sb3_sparse.policies.compiled import plain_names
 from sb3_sparse.policies.costs import NORM_FLOPS
 from sb3_sparse.policies.registry import registered
@@ -27,6 +29,8 @@ SQUASHED = "actor.mu."
 """Output layers of TD3's actor and of actors with gSDE, which an activation follows."""
 
 IMPALA_BLOCK = ".layers."
+BLOCKS = ([Residual.name], [ResidualBlock.name])
+"""Names of the only children of residual blocks."""
 
 
 @dataclass(frozen=True)
@@ -209,7 +213,11 @@ def _place(root: nn.Module, name: str, weight: th.Tensor, bias: bool) -> Prunabl
 
 
 def _fill(root: nn.Module) -> None:
-    """Turn modules with numbered children into Sequentials, with an activation in each gap."""
+    """Turn modules into what they were, as far as names tell.
+
+    Numbered children are a Sequential, with an activation in each gap; an only child of the name
+    that residual blocks give is what a block adds to its input.
+    """
     for name, child in list(root.named_children()):
         _fill(child)
         numbers = [int(part) for part, _ in child.named_children() if part.isdigit()]
@@ -217,3 +225,7 @@ def _fill(root: nn.Module) -> None:
             members = dict(child.named_children())
             filled = (members.get(str(i), nn.ReLU()) for i in range(max(numbers) + 1))
             setattr(root, name, nn.Sequential(*filled))
+        elif [part for part, _ in child.named_children()] in BLOCKS and name.isdigit():
+            (layers,) = child.children()
+            if isinstance(layers, nn.Sequential):
+                setattr(root, name, Residual(*layers))

@@ -12,9 +12,10 @@ from torch import nn
 from torch.nn import functional
 
 from sb3_sparse import SparsityCallback
-from sb3_sparse.engine.auto import chains_of, choose
+from sb3_sparse.engine.auto import chains_of, choose, image_chains_of
 from sb3_sparse.engine.masked import MaskedStorage
 from sb3_sparse.engine.native import library
+from sb3_sparse.engine.residual import Residual
 from sb3_sparse.errors import UnsupportedError
 
 
@@ -75,6 +76,45 @@ def test_a_huge_layer_must_be_sparser(use, instructions):
     root = nn.Sequential(nn.Linear(513, 512))
     assert choose(root, layers_of(root, most), All()) == ["0"]
     assert choose(root, layers_of(root, most + 0.01), All()) == []
+
+
+def test_chains_of_images_are_convolutions_with_what_the_kernels_compute_between_them():
+    class Own(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.conv = nn.Conv2d(2, 2, 1)
+
+    root = nn.Sequential(
+        nn.Conv2d(1, 2, 3),
+        nn.ReLU(),
+        nn.MaxPool2d(2),
+        Residual(nn.ReLU(), nn.Conv2d(2, 2, 3, padding=1)),
+        nn.Conv2d(2, 2, 1),
+        nn.AvgPool2d(2),
+        nn.Conv2d(2, 2, 1),
+        nn.Conv2d(2, 2, 1, groups=2),  # which the kernels do not compute
+        nn.Conv2d(2, 2, 1),
+        Own(),
+        nn.Flatten(),
+        nn.Linear(2, 2),
+    )
+    names = [[layer.name for layer in run] for run in image_chains_of(root, layers_of(root))]
+    assert names == [["0", "3.residual.1", "4"], ["6"], ["8"], ["9.conv"]]
+
+
+@pytest.mark.parametrize("instructions", library.instruction_sets())
+def test_convolutions_are_sparse_if_all_together_are_sparse_enough(use, instructions):
+    use(instructions)
+    most = 0.5 if instructions in ("avx512", "avx2") else 0.25
+    root = nn.Sequential(nn.Conv2d(1, 16, 2), nn.ReLU(), nn.Conv2d(16, 15, 2))
+    layers = layers_of(root, most)  # 64 and 960 connections
+    assert choose(root, layers, All()) == ["0", "2"]
+    assert choose(root, layers, {"2"}) == ["2"]
+    layers[0].set_mask(np.ones(64, np.bool_))  # the first is dense,
+    layers[1].set_mask(np.arange(960) < 1024 * most - 64)  # and the second makes up for it
+    assert choose(root, layers, All()) == ["0", "2"]
+    layers[1].set_mask(np.arange(960) < 1024 * most - 63)
+    assert choose(root, layers, All()) == []
 
 
 def test_missing_kernels_keep_masks(monkeypatch, tmp_path):

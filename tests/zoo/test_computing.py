@@ -10,11 +10,13 @@ from pathlib import Path
 import pytest
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.torch_layers import NatureCNN
 from support import make
 
 import sb3_sparse
 from sb3_sparse.engine.native import library
 from sb3_sparse.errors import CorruptStateError
+from sb3_sparse.networks import ImpalaCNN
 from sb3_sparse.zoo.computing import (
     Computing,
     Session,
@@ -121,6 +123,17 @@ def test_inspect_tells_what_the_record_says_not_what_would_be_chosen_here(
     best = inspect_model(tmp_path / "best_model.zip")
     assert best.computing is None
     assert [layer.compute for layer in best.report.layers] == ["dense", "masked", "dense"]
+
+
+@pytest.mark.parametrize("extractor", [NatureCNN, ImpalaCNN])
+def test_inspect_tells_what_auto_chooses_for_images(extractor, tmp_path):
+    kwargs = dict(features_extractor_class=extractor, compute="auto", net_arch=[], sparsity=0.8)
+    model = make("DQN", "TinyImages-v0", policy_kwargs=kwargs)
+    model.save(tmp_path / "model")
+    chosen = {layer.name: layer.compute for layer in model.policy.sparsity_report().layers}
+    assert chosen["q_net.features_extractor.cnn.0"] == "sparse"
+    found = inspect_model(tmp_path / "model.zip").report.layers
+    assert {layer.name: layer.compute for layer in found} == chosen
 
 
 @pytest.fixture
