@@ -7,7 +7,7 @@ maps. A layout gives every map, and its gradient, a place in memory for images o
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from torch import nn
 
@@ -19,11 +19,10 @@ Shape = tuple[int, int, int]
 """Channels, height and width."""
 
 
-def _pair(value: object) -> tuple[int, int]:
-    if isinstance(value, int):
-        return value, value
-    assert isinstance(value, tuple)
-    return value[0], value[-1]
+def _pair(value: Any) -> tuple[int, int]:
+    if isinstance(value, Sequence):
+        return int(value[0]), int(value[-1])
+    return int(value), int(value)
 
 
 class Window(NamedTuple):

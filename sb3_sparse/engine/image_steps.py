@@ -50,12 +50,15 @@ def plan(modules: Sequence[nn.Module]) -> tuple[list[ImageStep], list[SparseConv
 
 
 def _is_pool(module: nn.Module) -> bool:
+    if type(module) is not nn.MaxPool2d:
+        return False
+    window = Window.of(module)
     return (
-        type(module) is nn.MaxPool2d
-        and module.dilation in (1, (1, 1))
+        module.dilation in (1, (1, 1))
         and not module.ceil_mode
         and not module.return_indices
-        and prod(Window.of(module).kernel) <= 128  # the kernels number them by bytes
+        and prod(window.kernel) <= 128  # the kernels number them by bytes
+        and all(2 * p <= k for k, _, p in zip(*window, strict=True))  # torch objects to more
     )
 
 
@@ -97,7 +100,7 @@ def _steps(tokens: Sequence[Token]) -> list[ImageStep] | None:
     for token in tokens:
         last = steps[-1] if steps else None
         if isinstance(token, _Enter):
-            if now != source:
+            if now != source or now in held:  # the kernels add one gradient to a block's input
                 return None
             held.append(now)
         elif isinstance(token, _Leave):
@@ -129,7 +132,7 @@ def _steps(tokens: Sequence[Token]) -> list[ImageStep] | None:
             and now not in held
         ):
             steps[-1] = last._replace(activation=token)
-        elif type(token) is nn.ReLU and last.copy is None:
+        elif type(token) is nn.ReLU and last.copy is None and not (token.inplace and now in held):
             maps += 1
             steps[-1] = last._replace(copy=maps)
             now = maps

@@ -13,7 +13,7 @@ import torch as th
 from torch.nn import functional
 from torch.nn.grad import conv2d_weight
 
-from sb3_sparse.engine.activations import number_of
+from sb3_sparse.engine.activations import ADJUSTABLE, number_of
 from sb3_sparse.engine.chains import Link, watched
 from sb3_sparse.engine.image_layout import LANES, ImageStep, Layout, Shape, lay_out
 from sb3_sparse.engine.layer import dense_weight
@@ -185,6 +185,8 @@ class ImagePass(NamedTuple):
         for step, argument in zip(self.steps, arguments, strict=True):
             if step.weight is None:
                 continue
+            if isinstance(step.activation, ADJUSTABLE):
+                argument.activation, argument.a, argument.b = number_of(step.activation)
             structure, values, bias = next(convolutions)
             for parameter in (values, bias):
                 if parameter is not None and not readable(parameter):

@@ -23,6 +23,8 @@ class ReusedMemory:
         :param size: number of elements
         :return: shape ``(size,)``
         """
+        if not size:
+            return self._block(0)[0]  # the block stays for those who need one
         try:
             block, count = self._blocks.pop()  # no other thread sees it meanwhile
         except IndexError:

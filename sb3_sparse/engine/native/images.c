@@ -75,9 +75,12 @@ static void convolve(const share_t *share, const image_step_t *step, taps_t taps
         if (step->add >= 0) row.add = add.at + i * add.row, row.add_channel = add.channel;
         if (step->copy >= 0) row.copy = copy.at + i * copy.row;
         run_row(out->width, out->channels, taps, step->bias, &row);
-        for (int64_t c = 0; c < out->channels && step->activation > RELU; c++)
-            activate(step->activation, (float)step->a, (float)step->b,
-                     y.at + c * y.channel + i * y.row, out->width * LANES);
+        for (int64_t c = 0; c < out->channels && step->activation > RELU; c++) {
+            float *at = y.at + c * y.channel + i * y.row, *to = copy.at + c * copy.channel + i * copy.row;
+            activate(step->activation, (float)step->a, (float)step->b, at, out->width * LANES);
+            for (int64_t n = 0; n < out->width * LANES && step->copy >= 0; n += WIDTH)
+                STORE(to + n, positive(LOAD(at + n)));
+        }
     }
 }
 
@@ -94,11 +97,12 @@ static void pool(const share_t *share, const image_step_t *step, int64_t tile) {
             for (int64_t j = 0; j < out->width; j++) {
                 int64_t top = i * step->stride_y - step->padding_y, left = j * step->stride_x - step->padding_x;
                 int64_t to = c * y.channel + i * y.row + j * LANES;
+                int64_t r0 = top < 0 ? -top : 0, s0 = left < 0 ? -left : 0;
                 for (int part = 0; part < LANES; part += WIDTH) {
                     vec best = -INFINITY + (vec){0};
-                    ivec which = {0};
-                    for (int64_t r = top < 0 ? -top : 0; r < step->kernel_y && top + r < in->height; r++)
-                        for (int64_t s = left < 0 ? -left : 0; s < step->kernel_x && left + s < in->width; s++) {
+                    ivec which = (int32_t)(r0 * step->kernel_x + s0) + (ivec){0};
+                    for (int64_t r = r0; r < step->kernel_y && top + r < in->height; r++)
+                        for (int64_t s = s0; s < step->kernel_x && left + s < in->width; s++) {
                             vec v = LOAD(x.at + c * x.channel + (top + r) * x.row + (left + s) * LANES + part);
                             ivec more = (v > best) | (v != v);
                             best = choose(more, v, best);
@@ -378,7 +382,7 @@ static int run(void (*work)(void *), const images_t *images, const map_t *maps, 
             list[l] = i && steps[l].value_grad ? next : steps[l].value_grad;
             next += i ? nnz_of(steps + l, maps) : 0;
             list[n + l] = i && steps[l].bias_grad ? next : steps[l].bias_grad;
-            next += i ? maps[steps[l].out].channels : 0;
+            next += i && steps[l].kind == CONVOLUTION ? maps[steps[l].out].channels : 0;
         }
     }
     run_shares(work, shares, sizeof *shares, count);

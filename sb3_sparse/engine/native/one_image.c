@@ -130,6 +130,7 @@ static void pool(const share_t *share, const image_step_t *step) {
                 int64_t shift = s - step->padding_x; /* j * stride_x + shift lies within the row */
                 int64_t first = shift < 0 ? (-shift + step->stride_x - 1) / step->stride_x : 0;
                 int64_t last = (in->width - 1 - shift) / step->stride_x;
+                if (shift >= in->width) continue;
                 if (last >= out->width) last = out->width - 1;
                 keep_larger(to + first, column + first * step->stride_x + shift, step->stride_x, last - first + 1);
             }

@@ -1,0 +1,271 @@
+"""Chains of sparse convolutions against dense, masked autograd."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+import pytest
+import torch as th
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from image_support import (
+    KINDS,
+    chains,
+    close,
+    compare,
+    convolution,
+    impala,
+    margin,
+    twins,
+    using,
+    whole,
+)
+from torch import nn
+
+from sb3_sparse.engine.native import library
+from sb3_sparse.engine.residual import Residual
+
+Activation = Callable[[], nn.Module]
+EXACT: list[Activation] = [
+    nn.Identity,
+    nn.ReLU,
+    nn.ReLU6,
+    partial(nn.LeakyReLU, 0.25),
+    partial(nn.LeakyReLU, -0.5),
+    partial(nn.Hardtanh, -2.0, 3.0),
+]
+"""Of whole numbers they make numbers that float32 can hold."""
+SMOOTH: list[Activation] = [
+    nn.Identity,
+    nn.ReLU,
+    nn.Tanh,
+    nn.Sigmoid,
+    nn.ELU,
+    partial(nn.ELU, 0.3),
+    partial(nn.CELU, 1.4),
+    nn.SELU,
+    partial(nn.LeakyReLU, 0.2),
+    partial(nn.Hardtanh, -0.5, 0.75),
+    nn.GELU,
+    nn.SiLU,
+]
+
+
+class Drawn:
+    """Modules on images, drawn one after the other so that sizes fit.
+
+    :param draw: of Hypothesis
+    :param activations: to draw from
+    :param pools: how many poolings there may be
+    """
+
+    def __init__(self, draw, activations: list[Activation], pools: int) -> None:
+        self.draw, self.activations, self.pools = draw, activations, pools
+        self.channels = draw(st.integers(1, 4))
+        self.size = [draw(st.integers(1, 9)), draw(st.integers(1, 9))]
+        self.shape = (self.channels, *self.size)
+        self.modules: list[nn.Module] = []
+        for _ in range(draw(st.integers(1, 4))):
+            self.modules += self.some(depth=2)
+
+    def __repr__(self) -> str:
+        return f"{self.shape} -> {self.modules}"
+
+    def some(self, depth: int) -> list[nn.Module]:
+        kind = self.draw(st.sampled_from(["convolution"] * 3 + ["pool", "block", "other", "inner"]))
+        if kind == "pool" and self.pools:
+            self.pools -= 1
+            return [self.pool(), *self.draw(st.sampled_from([[], [nn.ReLU()]]))]
+        if kind == "block" and depth:
+            return [self.block(depth)]
+        if kind == "inner" and depth:
+            return [nn.Sequential(*self.some(depth - 1), *self.some(depth - 1))]
+        if kind == "other":
+            return [self.activation()]
+        in_place = self.draw(st.booleans())
+        return [self.convolution(), nn.ReLU(inplace=True) if in_place else self.activation()]
+
+    def activation(self) -> nn.Module:
+        return self.draw(st.sampled_from(self.activations))()
+
+    def convolution(self) -> nn.Conv2d:
+        pairs = st.tuples(st.integers(1, 4), st.integers(1, 4))
+        kernel, stride = self.draw(pairs), self.draw(st.sampled_from([(1, 1), (2, 1), (2, 3)]))
+        padding = self.draw(st.tuples(st.integers(0, 2), st.integers(0, 2)))
+        padding = tuple(
+            max(p, (k - size + 1) // 2)
+            for p, k, size in zip(padding, kernel, self.size, strict=True)
+        )
+        outputs, bias = self.draw(st.integers(1, 4)), self.draw(st.booleans())
+        layer = nn.Conv2d(self.channels, outputs, kernel, stride, padding, bias=bias)
+        self.channels = outputs
+        self._measure(kernel, stride, padding)
+        return layer
+
+    def pool(self) -> nn.MaxPool2d:
+        kernel = tuple(min(self.draw(st.integers(1, 3)), size) for size in self.size)
+        stride = self.draw(st.tuples(st.integers(1, 3), st.integers(1, 3)))
+        padding = tuple(self.draw(st.integers(0, k // 2)) for k in kernel)
+        self._measure(kernel, stride, padding)
+        return nn.MaxPool2d(kernel, stride, padding)
+
+    def block(self, depth: int) -> Residual:
+        """A block whose convolutions keep the size; those within may change the channels."""
+        before, inner = self.channels, list[nn.Module]()
+        for _ in range(self.draw(st.integers(0, 2))):
+            nested = depth > 1 and self.draw(st.integers(0, 3)) == 0
+            inner += [self.block(depth - 1)] if nested else self._same(self.draw(st.integers(1, 3)))
+        inner += self._same(before)
+        return Residual(*inner)
+
+    def _same(self, outputs: int) -> list[nn.Module]:
+        kernel = self.draw(st.sampled_from([(1, 1), (3, 3), (1, 3), (5, 1)]))
+        layer = nn.Conv2d(self.channels, outputs, kernel, padding=tuple(k // 2 for k in kernel))
+        self.channels = outputs
+        return [*self.draw(st.sampled_from([[], [self.activation()], [nn.ReLU()]])), layer]
+
+    def _measure(self, *window: tuple[int, ...]) -> None:
+        self.size = [
+            (size + 2 * p - k) // s + 1 for size, k, s, p in zip(self.size, *window, strict=True)
+        ]
+
+
+def drawn(activations: list[Activation], pools: int) -> st.SearchStrategy[Drawn]:
+    return st.composite(lambda draw: Drawn(draw, activations, pools))()
+
+
+CALLS = dict(
+    kind=st.sampled_from(KINDS),
+    batch=st.sampled_from([1, 2, 15, 16, 17, 33]),
+    instructions=st.sampled_from(library.instruction_sets()),
+    seed=st.integers(0, 2**20),
+)
+
+
+@settings(max_examples=150, deadline=None)
+@given(network=drawn(EXACT, pools=3), **CALLS)
+def test_whole_numbers_go_through_any_chain_as_through_dense_layers(
+    network, kind, batch, instructions, seed
+):
+    # Sums are exact, so that equal entries of a window are equal to both sides: the first counts.
+    dense, sparse = twins(*network.modules, seed=seed, kind=kind, whole=True)
+    draws = th.Generator().manual_seed(seed)
+    x = th.randint(-3, 4, (batch, *network.shape), generator=draws).float()
+    with using(instructions):
+        compare(dense, sparse, x, seed, whole=True)
+
+
+@settings(max_examples=60, deadline=None)
+@given(network=drawn(SMOOTH, pools=1), **CALLS)
+def test_any_numbers_go_through_any_chain_as_through_dense_layers(
+    network, kind, batch, instructions, seed
+):
+    dense, sparse = twins(*network.modules, seed=seed, kind=kind)
+    x = th.randn(batch, *network.shape, generator=th.Generator().manual_seed(seed))
+    assume(margin(dense, x) > 1e-5)
+    with using(instructions):
+        compare(dense, sparse, x, seed)
+
+
+@pytest.mark.parametrize("batch", [1, 4, 5, 15, 16, 17, 33, 64])
+def test_every_instruction_set_handles_every_batch(instructions, batch):
+    dense, sparse = twins(*impala())
+    x = th.randn(batch, 2, 7, 9, generator=th.Generator().manual_seed(4))
+    compare(dense, sparse, x)
+    assert chains(sparse) == [7]
+
+
+def test_instruction_sets_agree():
+    _, sparse = twins(*impala()[:-1], whole=True)
+    x = whole(20, 2, 7, 9)
+    found = []
+    for name in library.instruction_sets():
+        with using(name):
+            sparse.zero_grad()
+            y = sparse(x)
+            y.backward(whole(*y.shape))
+            with th.no_grad():
+                acted = sparse(x[:1])
+            found.append([y.detach(), acted, *(p.grad.clone() for p in sparse.parameters())])
+    for other in found[1:]:
+        for ours, first in zip(other, found[0], strict=True):
+            np.testing.assert_array_equal(ours, first)
+
+
+@pytest.mark.parametrize("batch", [1, 4, 40])
+def test_results_do_not_depend_on_the_number_of_threads(batch):
+    _, sparse = twins(*impala())
+    x, before = th.randn(batch, 2, 7, 9), th.get_num_threads()
+    found = []
+    try:
+        for count in (1, 2, 2, 3):
+            th.set_num_threads(count)
+            sparse.zero_grad()
+            ours = x.clone().requires_grad_()
+            y = sparse(ours)
+            y.square().sum().backward()
+            with th.no_grad():
+                acted = sparse(x)
+            grads = [p.grad.clone() for p in sparse.parameters()]
+            found.append(([y.detach(), acted, ours.grad], grads))
+    finally:
+        th.set_num_threads(before)
+    (results, grads), *others = found
+    for other, sums in others:
+        for ours, one in zip(other, results, strict=True):
+            np.testing.assert_array_equal(ours, one)
+        for ours, one in zip(sums, grads, strict=True):
+            close(ours, one)
+    for ours, one in zip(found[1][1], found[2][1], strict=True):
+        np.testing.assert_array_equal(ours, one)
+
+
+def test_a_graph_does_not_change_the_result():
+    _, sparse = twins(*impala())
+    x = th.randn(21, 2, 7, 9)
+    with th.no_grad():
+        acted = sparse(x)
+    np.testing.assert_array_equal(acted, sparse(x).detach())
+
+
+def test_an_empty_batch_has_gradients_of_zero():
+    dense, sparse = twins(*impala())
+    x = th.zeros(0, 2, 7, 9, requires_grad=True)
+    y = sparse(x)
+    assert y.shape == dense(x).shape
+    y.sum().backward()
+    assert x.grad.shape == x.shape
+    assert not any(parameter.grad.any() for parameter in sparse.parameters())
+    with th.no_grad():
+        assert sparse(x).shape == y.shape
+
+
+@pytest.mark.parametrize(
+    ("modules", "expected"),
+    [
+        ([convolution(), nn.ReLU(), convolution(), nn.Tanh(), nn.MaxPool2d(2)], [3]),
+        ([nn.ReLU(), convolution(), nn.ReLU()], [1]),
+        ([nn.MaxPool2d(2), convolution()], [1]),
+        ([nn.Sequential(nn.MaxPool2d(2), convolution()), convolution()], [3]),
+        ([convolution(), nn.GELU(), convolution(), nn.ReLU(), convolution()], [1, 2]),
+        ([convolution(), nn.MaxPool2d(2, ceil_mode=True), convolution()], [1, 1]),
+        ([convolution(), nn.MaxPool2d(2, dilation=2), convolution()], [1, 1]),
+        ([convolution(), nn.AvgPool2d(2), convolution()], [1, 1]),
+        ([convolution(), nn.MaxPool2d([2, 3]), convolution()], [3]),
+        ([Residual(convolution()), convolution()], [2]),
+        ([convolution(), Residual(nn.ReLU(), convolution()), nn.ReLU(), convolution()], [3]),
+        ([convolution(), nn.ReLU(), Residual(nn.MaxPool2d(3, 1, 1), convolution())], [3]),
+        ([convolution(), Residual(convolution(), Residual(nn.ReLU(), convolution()))], [1]),
+        ([convolution(), Residual(convolution(), nn.ReLU())], [1]),
+        ([convolution(), nn.Flatten(), nn.ReLU()], [1]),
+    ],
+    ids=lambda value: (
+        "" if isinstance(value[0], int) else "-".join(type(m).__name__ for m in value)
+    ),
+)
+def test_what_the_kernels_compute_goes_through_them_in_as_few_calls_as_possible(modules, expected):
+    dense, sparse = twins(*modules, whole=True)
+    compare(dense, sparse, whole(17, 2, 5, 6), whole=True)
+    assert chains(sparse) == expected
