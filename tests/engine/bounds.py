@@ -96,14 +96,20 @@ def one_act(lib, random, widths: list[int], batch: int, broken: bool):
     assert lib.sb3_sparse_act(packed, *sizes, *pointers) in (0, 1)
 
 
-def main() -> None:
-    path, instructions, *broken = sys.argv[1:]
+def loaded(path: str, instructions: str) -> ctypes.CDLL:
+    """The library, with an instruction set and threads to share."""
     lib = ctypes.CDLL(path)
     assert lib.sb3_sparse_use(instructions.encode()) == 0
     openmp = ctypes.CDLL("libgomp.so.1")
     names = ("GOMP_parallel", "omp_get_thread_num", "omp_get_num_threads")
     functions = [ctypes.cast(getattr(openmp, name), ctypes.c_void_p) for name in names]
     lib.sb3_sparse_share_threads(*functions)
+    return lib
+
+
+def main() -> None:
+    path, instructions, *broken = sys.argv[1:]
+    lib = loaded(path, instructions)
     random = np.random.default_rng(0)
     count = 0
     for batch in (1, 3, 16, 17, 63, 64, 65, 130):

@@ -119,24 +119,34 @@ def test_without_a_compiler_there_is_a_wheel_without_the_library(tmp_path):
     assert "the sparse kernels were not compiled" in said
 
 
-@NEEDS_COMPILER
-@pytest.mark.parametrize("instructions", library.instruction_sets())
-def test_the_kernels_stay_within_bounds_under_the_address_sanitizer(tmp_path, instructions):
-    made = tmp_path / "kernels.so"
+@pytest.fixture(scope="module")
+def sanitized(tmp_path_factory):
+    """Runs a program on kernels that the address sanitizer watches."""
+    made = tmp_path_factory.mktemp("sanitized") / "kernels.so"
     build_hook().compile_kernels(SOURCES, made, ("-fsanitize=address", "-g", "-O1"))
     runtime = subprocess.run(
         ["gcc", "-print-file-name=libasan.so"], check=True, capture_output=True, text=True
     ).stdout.strip()
-    done = subprocess.run(
-        [sys.executable, str(Path(__file__).with_name("bounds.py")), str(made), instructions],
-        env={**os.environ, "LD_PRELOAD": runtime, "ASAN_OPTIONS": "detect_leaks=0"},
-        capture_output=True, text=True,
-    )  # fmt: skip
+    environment = {**os.environ, "LD_PRELOAD": runtime, "ASAN_OPTIONS": "detect_leaks=0"}
+
+    def run(program: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [sys.executable, str(Path(__file__).with_name(program)), str(made), *arguments],
+            env=environment, capture_output=True, text=True,
+        )  # fmt: skip
+
+    return run
+
+
+@NEEDS_COMPILER
+@pytest.mark.parametrize("program", ["bounds.py", "image_bounds.py"])
+@pytest.mark.parametrize("instructions", library.instruction_sets())
+def test_the_kernels_stay_within_bounds_under_the_address_sanitizer(
+    sanitized, instructions, program
+):
+    done = sanitized(program, instructions)
     assert done.returncode == 0, done.stderr[-3000:]
     assert done.stdout.split()[-1] == "passes"
-    broken = subprocess.run(  # the same with one connection beyond the input: it must be noticed
-        [sys.executable, str(Path(__file__).with_name("bounds.py")), str(made), instructions, "x"],
-        env={**os.environ, "LD_PRELOAD": runtime, "ASAN_OPTIONS": "detect_leaks=0"},
-        capture_output=True, text=True,
-    )  # fmt: skip
+    # The same with one connection or place beyond the end: it must be noticed.
+    broken = sanitized(program, instructions, "x")
     assert "AddressSanitizer: heap-buffer-overflow" in broken.stderr
