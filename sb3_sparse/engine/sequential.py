@@ -34,6 +34,14 @@ class ChainedSequential(nn.Sequential):
     """Activations within the chains whose parameters the user may change."""
     _kept: KeptInference
 
+    def __init__(self, *modules: Any) -> None:  # torch calls it for a slice
+        super().__init__(*modules)
+        self.forget()
+
+    def forget(self) -> None:
+        """Look for chains anew at the next call."""
+        vars(self).update(_seen=(), _steps=[], _adjustable=[], _kept=KeptInference())
+
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_seen": (), "_steps": [], "_adjustable": []}
 
@@ -119,9 +127,7 @@ def chain_up(root: nn.Module) -> None:
         if any(
             isinstance(child, SparseLinear) or has_convolution(child) for child in module.children()
         ):
-            become(module, ChainedSequential)
-            # More layers may be sparse now.
-            vars(module).update(_seen=(), _steps=[], _adjustable=[], _kept=KeptInference())
+            become(module, ChainedSequential).forget()  # more layers may be sparse now
         elif type(module) is ChainedSequential:
             unchain(module)
 
