@@ -100,6 +100,26 @@ def test_several_gradients_at_once_are_seen():
     assert seen == [False, True]
 
 
+def test_whatever_refers_to_memory_is_counted():
+    tensor, weight = th.zeros(4), th.ones(2, requires_grad=True)
+    alone = of_torch.use_count(tensor)
+    part = tensor[2:]
+    assert of_torch.use_count(tensor) == of_torch.use_count(part) == alone + 1
+    result = weight * part
+    del part
+    assert of_torch.use_count(tensor) == alone + 1  # the graph has saved it
+    result.sum().backward()
+    assert of_torch.use_count(tensor) == alone
+    result = weight * tensor[:2]
+    assert of_torch.use_count(tensor) == alone + 1
+    del result
+    assert of_torch.use_count(tensor) == alone
+    array = tensor[2:].numpy()
+    assert of_torch.use_count(tensor) > alone
+    del array
+    assert of_torch.use_count(tensor) == alone
+
+
 def test_sb3_has_the_names_that_are_read():
     env = make_vec_env("CartPole-v1")
     model = stable_baselines3.PPO("MlpPolicy", env, n_steps=4, batch_size=4, device="cpu")

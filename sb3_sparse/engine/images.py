@@ -285,8 +285,9 @@ class ImageChain:
         trains = th.is_grad_enabled() and (
             x.requires_grad or any(p is not None and p.requires_grad for p in parameters)
         )
-        call = self._call(tuple(x.shape[1:]), trains) if x.dim() == 4 else None
-        if seen or call is None:  # where sizes do not fit, torch says so
+        fits = not seen and x.dim() == 4  # a tracer's sizes are no numbers
+        call = self._call(tuple(x.shape[1:]), trains) if fits else None
+        if call is None:  # where sizes do not fit, torch says so
             return by_dense_weights(self.steps, structures, x, parameters)
         how = ImagePass(self.steps, call, structures, self._references, len(x), self._memory)
         x = x.contiguous().resolve_neg()

@@ -134,7 +134,18 @@ def test_a_traced_network_is_the_network(both, x):
     dense, sparse = both
     with th.no_grad():
         traced = th.jit.trace(sparse, x[:2])
-    close(traced(x), dense(x))
+    for count in (1, 17):
+        close(traced(x[:count]), dense(x[:count]))
+
+
+def test_a_tracers_sizes_are_not_taken_for_numbers():
+    _, sparse = twins(convolution())
+    sparse(th.zeros(1, 2, 3, 3))
+    ((chain, *_),) = sparse.requires_grad_(False)._steps
+    before = chain._call.cache_info()
+    with th.no_grad():
+        th.jit.trace(lambda x: chain(x), th.zeros(1, 2, 4, 4), check_trace=False)
+    assert chain._call.cache_info() == before
 
 
 def test_who_watches_operations_sees_dense_ones(both, x):
