@@ -1,9 +1,8 @@
-/* Products of a sparse convolution: sums over connections for a few places at once. */
+/* Products of a sparse convolution: by its input, and by its weights. */
 #ifndef SB3_SPARSE_CONVOLUTION_H
 #define SB3_SPARSE_CONVOLUTION_H
 
-#include "images.h"
-#include "vectors.h"
+#include "maps.h"
 
 #define PARTS (LANES / WIDTH) /* vectors to a place of a map */
 #if WIDTH == 16
@@ -14,12 +13,7 @@
 #define PLACES 3
 #endif
 
-/* Keeps a compiler from spending a register on the address of each place. */
-#if defined(__GNUC__)
-#define ADDRESS(p) __asm__("" : "+r"(p))
-#else
-#define ADDRESS(p) (void)(p)
-#endif
+#define DOTS_PLACES 64 /* places of an output that a round of dot products covers, about */
 
 /* The connections of a convolution as offsets: of an output's, in the input and its ring. */
 typedef struct {
@@ -105,6 +99,61 @@ static void run_row(int64_t width, int64_t outputs, taps_t taps, const float *bi
         if (block.add) block.add += first * row->out_step;
         if (block.copy) block.copy += first * row->out_step;
         run_block(last - first, outputs, taps, bias, &block);
+    }
+}
+
+/* grad[0..count) (+)= sums over places of a few rows of an output's gradient times `count` inputs. */
+INLINE void dots_of(int count, int64_t rows, int64_t places, const float *g, int64_t g_row, const float *x,
+                    int64_t x_row, int64_t x_step, const int32_t *offset, float *grad, int add) {
+    vec sum[8];
+    for (int q = 0; q < count; q++) sum[q] = (vec){0};
+    for (int64_t i = 0; i < rows; i++, g += g_row, x += x_row) {
+        const float *to[8];
+        for (int q = 0; q < count; q++) to[q] = x + offset[q];
+        for (int64_t j = 0; j < places; j++)
+            for (int part = 0; part < LANES; part += WIDTH) {
+                vec d = LOAD(g + j * LANES + part);
+                for (int q = 0; q < count; q++) sum[q] += d * LOAD(to[q] + j * x_step + part);
+            }
+    }
+    if (count == 8)
+        totals(sum, grad, add);
+    else
+        for (int q = 0; q < count; q++) grad[q] = (add ? grad[q] : 0) + total(sum[q]);
+}
+
+/* grad[k] (+)= sum over places of g[output of k] * x at the connection's offset. */
+static inline void dots(const image_step_t *step, const map_t *out, taps_t taps, plane_t x, plane_t g,
+                 float *grad, int add) {
+    int64_t most = DOTS_PLACES / out->width > 1 ? DOTS_PLACES / out->width : 1;
+    int64_t x_row = step->stride_y * x.row, x_step = step->stride_x * LANES;
+    for (int64_t i = 0; i < out->height; i += most, add = 1) {
+        int64_t rows = i + most < out->height ? most : out->height - i;
+        for (int64_t o = 0; o < out->channels; o++) {
+            const float *d = g.at + o * g.channel + i * g.row, *from = x.at + i * x_row;
+            for (int32_t k = taps.start[o], count; k < taps.start[o + 1]; k += count) {
+                count = taps.start[o + 1] - k;
+#define CASE(N)                                                                                    \
+    case N: dots_of(N, rows, out->width, d, g.row, from, x_row, x_step, taps.offset + k, grad + k, add); break;
+                switch (count) {
+                    CASE(1) CASE(2) CASE(3) CASE(4) CASE(5) CASE(6) CASE(7)
+                default:
+                    count = 8;
+                    switch (count) { CASE(8) }
+                }
+#undef CASE
+            }
+        }
+    }
+}
+
+static inline void sums(const map_t *out, plane_t g, float *grad, int add) {
+    for (int64_t o = 0; o < out->channels; o++) {
+        vec sum[4] = {{0}}; /* of neighbours, whose sums do not wait for each other */
+        for (int64_t i = 0; i < out->height; i++)
+            for (int64_t j = 0, q = 0; j < out->width * LANES; j += WIDTH, q = (q + 1) & 3)
+                sum[q] += LOAD(g.at + o * g.channel + i * g.row + j);
+        grad[o] = (add ? grad[o] : 0) + total((sum[0] + sum[1]) + (sum[2] + sum[3]));
     }
 }
 

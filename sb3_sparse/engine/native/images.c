@@ -1,12 +1,11 @@
 /* Passes of a batch through a chain of convolutions and poolings, forth and back. */
 #include "activations.h"
 #include "convolution.h"
-#include "maps.h"
+#include "pooling.h"
 #include "threads.h"
 
 #include <stdlib.h>
 
-#define DOTS_PLACES 64 /* places of an output that a round of dot products covers, about */
 
 /* One thread's share of a batch: the tiles [first, last). */
 typedef struct {
@@ -39,31 +38,11 @@ static plane_t grad_of(const share_t *share, int64_t number) {
     return plane_of(map, share->scratch + map->grad_at, share->images->grad_ring, LANES);
 }
 
-/* Images [batch, channels, height, width] to and from a tile's map; lanes without an image are 0. */
-static void take_images(const map_t *map, plane_t to, const float *images, int64_t entries) {
-    int64_t size = map->height * map->width, stride = map->channels * size;
-    for (int64_t c = 0; c < map->channels; c++)
-        for (int64_t y = 0; y < map->height; y++) {
-            float *row = to.at + c * to.channel + y * to.row;
-            transpose_all(images + c * size + y * map->width, entries, map->width, stride, row, LANES);
-            for (int64_t x = 0; x < map->width && entries < LANES; x++)
-                memset(row + x * LANES + entries, 0, (LANES - entries) * sizeof *row);
-        }
-}
-
-static void give_images(const map_t *map, plane_t from, float *images, int64_t entries) {
-    int64_t size = map->height * map->width, stride = map->channels * size;
-    for (int64_t c = 0; c < map->channels; c++)
-        for (int64_t y = 0; y < map->height; y++)
-            transpose_all(from.at + c * from.channel + y * from.row, map->width, entries, LANES,
-                          images + c * size + y * map->width, stride);
-}
-
-static void convolve(const share_t *share, const image_step_t *step, taps_t taps, int64_t tile) {
+static void convolve(const share_t *share, const image_step_t *step, taps_t taps, int64_t tile, plane_t y,
+                     plane_t copy) {
     const map_t *out = share->maps + step->out;
-    plane_t x = map_of(share, step->in, tile), y = map_of(share, step->out, tile);
-    plane_t add = step->add < 0 ? y : map_of(share, step->add, tile);
-    plane_t copy = step->copy < 0 ? y : map_of(share, step->copy, tile);
+    plane_t x = map_of(share, step->in, tile), add = y;
+    if (step->add >= 0) add = map_of(share, step->add, tile);
     for (int64_t i = 0; i < out->height; i++) {
         block_t row = {.in = x.at + (i * step->stride_y - step->padding_y) * x.row -
                              step->padding_x * LANES,
@@ -84,35 +63,10 @@ static void convolve(const share_t *share, const image_step_t *step, taps_t taps
     }
 }
 
-/* The first largest number of each window, in torch's order; a NaN counts as largest. */
-static void pool(const share_t *share, const image_step_t *step, int64_t tile) {
-    const map_t *in = share->maps + step->in, *out = share->maps + step->out;
-    plane_t x = map_of(share, step->in, tile), y = map_of(share, step->out, tile);
-    plane_t copy = step->copy < 0 ? y : map_of(share, step->copy, tile);
-    int8_t *taken = 0;
-    if (share->images->kept)
-        taken = (int8_t *)(share->images->kept + tile * share->images->kept_size + step->taken);
-    for (int64_t c = 0; c < out->channels; c++)
-        for (int64_t i = 0; i < out->height; i++)
-            for (int64_t j = 0; j < out->width; j++) {
-                int64_t top = i * step->stride_y - step->padding_y, left = j * step->stride_x - step->padding_x;
-                int64_t to = c * y.channel + i * y.row + j * LANES;
-                int64_t r0 = top < 0 ? -top : 0, s0 = left < 0 ? -left : 0;
-                for (int part = 0; part < LANES; part += WIDTH) {
-                    vec best = -INFINITY + (vec){0};
-                    ivec which = (int32_t)(r0 * step->kernel_x + s0) + (ivec){0};
-                    for (int64_t r = r0; r < step->kernel_y && top + r < in->height; r++)
-                        for (int64_t s = s0; s < step->kernel_x && left + s < in->width; s++) {
-                            vec v = LOAD(x.at + c * x.channel + (top + r) * x.row + (left + s) * LANES + part);
-                            ivec more = (v > best) | (v != v);
-                            best = choose(more, v, best);
-                            which = (more & (int32_t)(r * step->kernel_x + s)) | (~more & which);
-                        }
-                    STORE(y.at + to + part, best);
-                    if (step->copy >= 0) STORE(copy.at + to + part, positive(best));
-                    for (int lane = 0; lane < WIDTH && taken; lane++) *taken++ = (int8_t)which[lane];
-                }
-            }
+/* Where the taps lie that a pooling takes; NULL where no backward pass follows. */
+static int8_t *taken_of(const share_t *share, const image_step_t *step, int64_t tile) {
+    const images_t *images = share->images;
+    return images->kept ? (int8_t *)(images->kept + tile * images->kept_size + step->taken) : 0;
 }
 
 /* A map that is about to be written: its ring is 0. */
@@ -133,63 +87,15 @@ static void forward_share(void *argument) {
         int64_t entries = entries_of(images, t);
         take_images(first, begin(share, 0, t), images->images_in + t * in, entries);
         for (const image_step_t *step = share->steps; step < end; step++) {
-            begin(share, step->out, t);
-            if (step->copy >= 0) begin(share, step->copy, t);
+            plane_t y = begin(share, step->out, t), copy = y;
+            if (step->copy >= 0) copy = begin(share, step->copy, t);
             if (step->kind == CONVOLUTION)
-                convolve(share, step, share->taps[step - share->steps], t);
+                convolve(share, step, share->taps[step - share->steps], t, y, copy);
             else
-                pool(share, step, t);
+                pool(step, share->maps + step->in, share->maps + step->out, map_of(share, step->in, t), y, copy,
+                     taken_of(share, step, t));
         }
         give_images(last, map_of(share, end[-1].out, t), images->images_out + t * out, entries);
-    }
-}
-
-/* grad[k] (+)= sum over places of g[output of k] * x at the connection's offset. */
-static void dots(const image_step_t *step, const map_t *out, taps_t taps, plane_t x, plane_t g,
-                 float *grad, int add) {
-    int64_t rows = DOTS_PLACES / out->width, places = out->width, in_step = step->stride_x * LANES;
-    if (rows < 1) rows = 1;
-    for (int64_t i = 0; i < out->height; i += rows) {
-        int64_t end = i + rows < out->height ? i + rows : out->height;
-        for (int64_t o = 0; o < out->channels; o++) {
-            int32_t k = taps.start[o], last = taps.start[o + 1];
-            const float *from = g.at + o * g.channel;
-            for (; k + 8 <= last; k += 8) {
-                vec sum[8];
-                for (int q = 0; q < 8; q++) sum[q] = (vec){0};
-                for (int64_t y = i; y < end; y++) {
-                    const float *d = from + y * g.row, *base = x.at + y * step->stride_y * x.row, *to[8];
-                    for (int q = 0; q < 8; q++) to[q] = base + taps.offset[k + q];
-                    for (int64_t j = 0; j < places; j++)
-                        for (int part = 0; part < LANES; part += WIDTH) {
-                            vec v = LOAD(d + j * LANES + part);
-                            for (int q = 0; q < 8; q++) sum[q] += v * LOAD(to[q] + j * in_step + part);
-                        }
-                }
-                totals(sum, grad + k, add || i);
-            }
-            for (; k < last; k++) {
-                vec sum = {0};
-                for (int64_t y = i; y < end; y++) {
-                    const float *d = from + y * g.row;
-                    const float *to = x.at + y * step->stride_y * x.row + taps.offset[k];
-                    for (int64_t j = 0; j < places; j++)
-                        for (int part = 0; part < LANES; part += WIDTH)
-                            sum += LOAD(d + j * LANES + part) * LOAD(to + j * in_step + part);
-                }
-                grad[k] = (add || i ? grad[k] : 0) + total(sum);
-            }
-        }
-    }
-}
-
-static void sums(const map_t *out, plane_t g, float *grad, int add) {
-    for (int64_t o = 0; o < out->channels; o++) {
-        vec sum[4] = {{0}}; /* of neighbours, whose sums do not wait for each other */
-        for (int64_t i = 0; i < out->height; i++)
-            for (int64_t j = 0, q = 0; j < out->width * LANES; j += WIDTH, q = (q + 1) & 3)
-                sum[q] += LOAD(g.at + o * g.channel + i * g.row + j);
-        grad[o] = (add ? grad[o] : 0) + total((sum[0] + sum[1]) + (sum[2] + sum[3]));
     }
 }
 
@@ -224,32 +130,6 @@ static void convolve_back(const share_t *share, const image_step_t *step, taps_t
         }
 }
 
-static void pool_back(const share_t *share, const image_step_t *step, int64_t tile) {
-    const map_t *in = share->maps + step->source, *out = share->maps + step->out;
-    plane_t g = grad_of(share, step->out), to = grad_of(share, step->source);
-    const int8_t *taken =
-        (const int8_t *)(share->images->kept + tile * share->images->kept_size + step->taken);
-    if (!step->adds)
-        memset(share->scratch + in->grad_at, 0, size_of(in, share->images->grad_ring, LANES) * sizeof(float));
-    for (int64_t c = 0; c < out->channels; c++)
-        for (int64_t i = 0; i < out->height; i++)
-            for (int64_t j = 0; j < out->width; j++) {
-                int64_t top = i * step->stride_y - step->padding_y;
-                int64_t left = j * step->stride_x - step->padding_x;
-                for (int part = 0; part < LANES; part += WIDTH, taken += WIDTH) {
-                    vec d = LOAD(g.at + c * g.channel + i * g.row + j * LANES + part);
-                    ivec which;
-                    for (int lane = 0; lane < WIDTH; lane++) which[lane] = taken[lane];
-                    for (int64_t r = top < 0 ? -top : 0; r < step->kernel_y && top + r < in->height; r++)
-                        for (int64_t s = left < 0 ? -left : 0; s < step->kernel_x && left + s < in->width; s++) {
-                            float *at = to.at + c * to.channel + (top + r) * to.row + (left + s) * LANES + part;
-                            ivec here = which == (int32_t)(r * step->kernel_x + s);
-                            STORE(at, LOAD(at) + (vec)(here & (ivec)d));
-                        }
-                }
-            }
-}
-
 static int goes_back(const share_t *share, const image_step_t *step) {
     return step->source || share->images->images_in_grad;
 }
@@ -268,7 +148,13 @@ static void backward_share(void *argument) {
             const image_step_t *step = share->steps + n;
             const map_t *out = share->maps + step->out;
             if (step->kind == POOLING) {
-                if (goes_back(share, step)) pool_back(share, step, t);
+                const map_t *source = share->maps + step->source;
+                if (!goes_back(share, step)) continue;
+                if (!step->adds)
+                    memset(share->scratch + source->grad_at, 0,
+                           size_of(source, images->grad_ring, LANES) * sizeof(float));
+                pool_back(step, source, out, grad_of(share, step->out), grad_of(share, step->source),
+                          taken_of(share, step, t));
                 continue;
             }
             plane_t g = grad_of(share, step->out), y = map_of(share, step->out, t);

@@ -7,7 +7,6 @@
  */
 #include "activations.h"
 #include "convolution.h"
-#include "maps.h"
 #include "threads.h"
 
 #include <stdlib.h>
