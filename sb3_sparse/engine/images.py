@@ -2,245 +2,31 @@
 
 from __future__ import annotations
 
-import ctypes
 from collections.abc import Sequence
 from functools import cache, partial
-from itertools import chain
-from typing import Any, NamedTuple
+from typing import Any
 from weakref import ref
 
 import torch as th
-from torch.nn import functional
-from torch.nn.grad import conv2d_weight
 
-from sb3_sparse.engine.activations import ADJUSTABLE, number_of
 from sb3_sparse.engine.chains import Link, watched
-from sb3_sparse.engine.image_layout import LANES, ImageStep, Layout, Shape, lay_out
-from sb3_sparse.engine.layer import dense_weight
-from sb3_sparse.engine.native.library import (
-    ImagesArgument,
-    ImageStepArgument,
-    MapArgument,
-    library,
-    readable,
-)  # fmt: skip
+from sb3_sparse.engine.image_layout import LANES, ImageStep
+from sb3_sparse.engine.image_pass import FEW, ImagePass, by_dense_weights, prepare
 from sb3_sparse.engine.products import Products
 from sb3_sparse.engine.reused import ReusedMemory
 from sb3_sparse.engine.structure import Structure
 from sb3_sparse.errors import UnsupportedError
 
-_empty = partial(th.empty, dtype=th.float32, device="cpu")
-FEW = 4
-"""Up to so many images are computed one by one where no backward pass follows."""
 
+def pays(batch: int, structures: Sequence[Structure]) -> bool:
+    """Whether tiles of a batch are worth it, though lanes without an image compute as well.
 
-class Call(NamedTuple):
-    """What the kernels take of a chain for images of one size.
+    As for a full tile, what is computed must be at most half of what dense weights compute.
 
-    :param layout: of the maps in memory
-    :param maps: an array of ``map_t``
-    :param arguments: an array of ``image_step_t``, without addresses
-    """
-
-    layout: Layout
-    maps: Any
-    arguments: Any
-
-
-def prepare(steps: Sequence[ImageStep], shape: Shape, keep: bool) -> Call | None:
-    """Prepare calls for images of a shape; None if the shape does not fit the steps.
-
-    :param keep: whether a backward pass may follow
-    """
-    layout = lay_out(steps, shape, keep)
-    if layout is None:
-        return None
-    maps = [MapArgument(*m.shape, m.kept, m.at, _or_none(m.grad_at)) for m in layout.maps]
-    arguments = [
-        ImageStepArgument(
-            step.weight is None,
-            step.input, step.source, step.output, _or_none(step.add), _or_none(step.copy),
-            _or_none(back.gate), back.adds, back.slope,
-            *chain.from_iterable(step.window), taken, *number_of(step.activation),
-        )
-        for step, taken, back in zip(steps, layout.taken, layout.backward, strict=True)
-    ]  # fmt: skip
-    return Call(
-        layout,
-        (MapArgument * len(maps))(*maps),
-        (ImageStepArgument * len(arguments))(*arguments),
-    )
-
-
-def _or_none(number: int | None) -> int:
-    return -1 if number is None else number
-
-
-class ImagePass(NamedTuple):
-    """One forward pass of a batch through a chain, and the backward pass if there is one.
-
-    :param steps: the steps
-    :param call: what the kernels take for images of this size
     :param structures: connections of each convolution
-    :param layers: weak references to the convolutions
-    :param batch: images of the batch
-    :param memory: for the maps that the backward pass reads
     """
-
-    steps: Sequence[ImageStep]
-    call: Call
-    structures: list[Structure]
-    layers: list[Any]
-    batch: int
-    memory: ReusedMemory
-
-    @property
-    def keeps_result(self) -> bool:
-        """Whether the backward pass reads the result: what it needs is among the kept maps."""
-        return False
-
-    def forward(self, x: th.Tensor, parameters: Sequence[Any]) -> tuple[th.Tensor, th.Tensor, Any]:
-        """Compute the result, all that the backward pass reads, and nothing else."""
-        layout = self.call.layout
-        y = _empty(self.batch, *layout.maps[self.steps[-1].output].shape)
-        kept = self.memory(-(-self.batch // LANES) * layout.kept_size)
-        images = self._images(layout.forward_size, kept, images_in=x.data_ptr())
-        images.images_out = y.data_ptr()
-        alone = not layout.kept_size and self.batch <= FEW
-        self._run("one_by_one" if alone else "forward", images, self._arguments(parameters))
-        return y, kept, None
-
-    def backward(
-        self,
-        x: th.Tensor,
-        kept: th.Tensor,
-        parameters: Sequence[th.Tensor | None],
-        needs: Sequence[bool],
-        grad: th.Tensor,
-        _: Any,
-    ) -> list[th.Tensor | None]:
-        """Compute the gradients of the input and of each parameter; None where not needed.
-
-        :param kept: the maps that :meth:`forward` kept
-        :param needs: whether the gradient of the input and of each parameter is needed
-        :param grad: gradient of the result
-        """
-        needs_x, *needed = needs
-        grads = [
-            th.empty_like(parameter) if need and parameter is not None else None
-            for parameter, need in zip(parameters, needed, strict=True)
-        ]
-        arguments = self._arguments(parameters)
-        listening: list[tuple[ImageStep, Any, th.Tensor]] = []
-        convolutions = [i for i, step in enumerate(self.steps) if step.weight is not None]
-        for n, i in enumerate(convolutions):
-            step, argument = self.steps[i], arguments[i]
-            value_grad, bias_grad = grads[2 * n : 2 * n + 2]
-            if bias_grad is not None:
-                argument.bias_grad = bias_grad.data_ptr()
-            if value_grad is None:
-                continue
-            argument.value_grad = value_grad.data_ptr()
-            listener = None if (module := self.layers[n]()) is None else module.listener
-            if listener is not None and listener.wanted():
-                output_grad = _empty(self.batch, *self.call.layout.maps[step.output].shape)
-                argument.output_grad = output_grad.data_ptr()
-                listening.append((step, listener, output_grad))
-        grad_x = th.empty_like(x) if needs_x else None
-        images = self._images(self.call.layout.backward_size, kept, images_out_grad=grad.data_ptr())
-        images.images_in_grad = 0 if grad_x is None else grad_x.data_ptr()
-        self._run("backward", images, arguments)
-        for step, listener, output_grad in listening:
-            listener.note(partial(self._outer, kept, step, output_grad))
-        return [grad_x, *grads]
-
-    def by_dense_weights(self, x: th.Tensor, parameters: Sequence[Any]) -> th.Tensor:
-        """Compute the same result by dense weights, which torch can differentiate repeatedly."""
-        return by_dense_weights(self.steps, self.structures, x, parameters)
-
-    def _images(self, scratch: int, kept: th.Tensor, **addresses: int) -> Any:
-        layout = self.call.layout
-        return ImagesArgument(
-            steps=len(self.steps),
-            maps=len(layout.maps),
-            batch=self.batch,
-            threads=th.get_num_threads(),
-            ring=layout.ring,
-            grad_ring=layout.grad_ring,
-            kept_size=layout.kept_size,
-            scratch_size=scratch,
-            kept=kept.data_ptr() if layout.kept_size else 0,
-            **addresses,
-        )
-
-    def _run(self, name: str, images: Any, arguments: Any) -> None:
-        run = getattr(library(), f"sb3_sparse_images_{name}")
-        if run(ctypes.byref(images), self.call.maps, arguments):
-            raise MemoryError(f"no memory for the {name} pass of a chain of sparse convolutions")
-
-    def _arguments(self, parameters: Sequence[Any]) -> Any:
-        """An array of ``image_step_t``, without gradients."""
-        arguments = type(self.call.arguments).from_buffer_copy(self.call.arguments)
-        convolutions = zip(self.structures, parameters[::2], parameters[1::2], strict=True)
-        for step, argument in zip(self.steps, arguments, strict=True):
-            if step.weight is None:
-                continue
-            if isinstance(step.activation, ADJUSTABLE):
-                argument.activation, argument.a, argument.b = number_of(step.activation)
-            structure, values, bias = next(convolutions)
-            for parameter in (values, bias):
-                if parameter is not None and not readable(parameter):
-                    raise UnsupportedError(
-                        "weights and biases of layers in sparse storage must be contiguous float32 "
-                        f"on the CPU, got {parameter.dtype} on {parameter.device} with strides "
-                        f"{parameter.stride()}"
-                    )
-            if values.numel() != structure.nnz:
-                raise RuntimeError("a layer's connections have changed while it was computing")
-            argument.row_start, argument.column, *by_columns = structure.addresses
-            argument.column_start, argument.row, argument.position = by_columns
-            argument.value = values.data_ptr()
-            argument.bias = 0 if bias is None else bias.data_ptr()
-        return arguments
-
-    def _outer(self, kept: th.Tensor, step: ImageStep, output_grad: th.Tensor) -> th.Tensor:
-        """Compute a convolution's dense gradient from its kept input and its output's gradient."""
-        shape, _, at, _ = self.call.layout.maps[step.input]
-        channels, height, width = shape
-        ring = self.call.layout.ring
-        size = channels * (height + 2 * ring) * (width + 2 * ring) * LANES
-        tiles = kept.view(-1, self.call.layout.kept_size)[:, at : at + size]
-        x = tiles.view(-1, channels, height + 2 * ring, width + 2 * ring, LANES)
-        x = x[:, :, ring : ring + height, ring : ring + width]
-        x = x.permute(0, 4, 1, 2, 3).reshape(-1, *shape)[: self.batch]
-        assert step.weight is not None
-        grad: th.Tensor = conv2d_weight(x, step.weight, output_grad, *step.window[1:])  # type: ignore[no-untyped-call]
-        return grad
-
-
-def by_dense_weights(
-    steps: Sequence[ImageStep],
-    structures: Sequence[Structure],
-    x: th.Tensor,
-    parameters: Sequence[Any],
-) -> th.Tensor:
-    """Compute the result of a chain by dense weights."""
-    maps = {0: x}
-    convolutions = zip(structures, parameters[::2], parameters[1::2], strict=True)
-    for step in steps:
-        y = maps[step.input]
-        if step.weight is None:
-            y = functional.max_pool2d(y, *step.window)
-        else:
-            structure, values, bias = next(convolutions)
-            weight = dense_weight(structure, values, step.weight)
-            y = functional.conv2d(y, weight, bias, *step.window[1:])
-        if step.activation is not None:
-            y = step.activation(y)
-        maps[step.output] = y if step.add is None else y + maps[step.add]
-        if step.copy is not None:
-            maps[step.copy] = maps[step.output].relu()
-    return maps[steps[-1].output]
+    size = sum(rows * columns for rows, columns in (one.shape for one in structures))
+    return batch >= LANES or 2 * LANES * sum(one.nnz for one in structures) <= batch * size
 
 
 class ImageChain:
@@ -289,6 +75,8 @@ class ImageChain:
         call = self._call(tuple(x.shape[1:]), trains) if fits else None
         if call is None:  # where sizes do not fit, torch says so
             return by_dense_weights(self.steps, structures, x, parameters)
+        if not (pays(len(x), structures) or (len(x) <= FEW and not trains)):
+            return by_dense_weights(self.steps, structures, x, parameters, self._references)
         how = ImagePass(self.steps, call, structures, self._references, len(x), self._memory)
         x = x.contiguous().resolve_neg()
         if trains:

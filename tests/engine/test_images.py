@@ -22,8 +22,11 @@ from image_support import (
 )
 from torch import nn
 
+from sb3_sparse.engine.image_pass import ImagePass
+from sb3_sparse.engine.images import pays
 from sb3_sparse.engine.native import library
 from sb3_sparse.engine.residual import Residual
+from sb3_sparse.engine.structure import Structure
 
 CALLS = dict(
     kind=st.sampled_from(KINDS),
@@ -158,3 +161,23 @@ def test_what_the_kernels_compute_goes_through_them_in_as_few_calls_as_possible(
     dense, sparse = twins(*modules, whole=True)
     compare(dense, sparse, whole(17, 2, 5, 6), whole=True)
     assert chains(sparse) == expected
+
+
+@pytest.mark.parametrize(
+    ("batch", "nnz", "expected"),
+    [(5, 15, True), (5, 16, False), (15, 45, True), (15, 46, False), (16, 96, True)],
+)
+def test_lanes_without_an_image_must_not_cost_more_than_zeros(batch, nnz, expected):
+    # Of 96 connections; sixteen lanes at 15 of them are as much as 2 x 240 = 5 x 96.
+    structures = [
+        Structure(np.arange(nnz // 2), (4, 12)),
+        Structure(np.arange(-(-nnz // 2)), (6, 8)),
+    ]
+    assert pays(batch, structures) is expected
+
+
+def test_few_images_and_many_connections_take_dense_weights(monkeypatch):
+    monkeypatch.setattr("sb3_sparse.engine.images.pays", pays)
+    monkeypatch.setattr(ImagePass, "backward", None)  # which is not called
+    dense, sparse = twins(convolution(), nn.ReLU(), convolution(), kind="full")
+    compare(dense, sparse, th.randn(5, 2, 6, 5))

@@ -1,0 +1,11 @@
+from __future__ import annotations
+
+import pytest
+
+
+@pytest.fixture(autouse=True, scope="package")
+def every_batch_by_kernels():
+    """Also few images go through the kernels, which are what is tested here."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sb3_sparse.engine.images.pays", lambda *_: True)
+        yield
