@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_sparse.export import ckernels
+from sb3_sparse.export.cfunctions import FUNCTIONS
 from sb3_sparse.export.cheader import PROTOTYPE, WIDTH, about, declarations
 from sb3_sparse.export.graph import Graph
 from sb3_sparse.export.layout import grouped, side_by_side
@@ -133,9 +134,9 @@ class _Writer:
     def _call(self, function: str, *arguments: object, source: str = "") -> None:
         """Append a call.
 
-        :param source: text of the function; by default that in :data:`ckernels.FUNCTIONS`
+        :param source: text of the function; by default that in :data:`FUNCTIONS`
         """
-        self.functions[function] = source or ckernels.FUNCTIONS[function]
+        self.functions[function] = source or FUNCTIONS[function]
         self.calls.append(f"{function}({', '.join(map(str, arguments))});")
 
     def _elementwise(
