@@ -3,6 +3,7 @@
 
 #include "activations.h"
 #include "products.h"
+#include "threads.h"
 
 #include "dense.h"
 
@@ -282,22 +283,23 @@ typedef struct {
     int64_t tiles, shares;
 } phase_t;
 
-static void run_share(const phase_t *phase, int64_t share) {
-    where_t where = {.program = phase->program, .thread = share};
-    where.first_tile = phase->tiles * share / phase->shares;
-    int64_t end = phase->tiles * (share + 1) / phase->shares;
+typedef struct {
+    const phase_t *phase;
+    int64_t number;
+} share_t;
+
+static void run_share(void *argument) {
+    const share_t *share = argument;
+    const phase_t *phase = share->phase;
+    where_t where = {.program = phase->program, .thread = share->number};
+    where.first_tile = phase->tiles * share->number / phase->shares;
+    int64_t end = phase->tiles * (share->number + 1) / phase->shares;
     for (where.tile = where.first_tile; where.tile < end; where.tile++) {
         int64_t left = phase->program->batch - where.tile * TILE;
         where.entries = left < TILE ? left : TILE;
         where.vectors = (where.entries + WIDTH - 1) / WIDTH;
         for (const operation_t *o = phase->first; o < phase->last; o++) run_tiled(o, &where);
     }
-}
-
-static void take_shares(void *argument) {
-    const phase_t *phase = argument;
-    for (int64_t i = sb3_sparse_openmp.thread(); i < phase->shares; i += sb3_sparse_openmp.threads())
-        run_share(phase, i);
 }
 
 static void add_to(float *to, const float *from, int64_t count) {
@@ -307,16 +309,13 @@ static void add_to(float *to, const float *from, int64_t count) {
 static void run_phase(const program_t *program, const operation_t *first, const operation_t *last) {
     int64_t tiles = (program->batch + TILE - 1) / TILE;
     phase_t phase = {program, first, last, tiles, 1};
+    share_t shares[MOST_SHARES];
     int captures = 0; /* what several threads would add up in one place */
     for (const operation_t *o = first; o < last; o++) captures |= o->kind == LINEAR_DENSE_GRAD;
-    if (sb3_sparse_openmp.parallel && !captures)
-        phase.shares = program->threads < tiles ? program->threads : tiles;
-    if (phase.shares <= 1) {
-        phase.shares = 1;
-        run_share(&phase, 0);
-        return;
-    }
-    sb3_sparse_openmp.parallel(take_shares, &phase, (unsigned)phase.shares, 0);
+    if (sb3_sparse_openmp.parallel && !captures) phase.shares = shares_of(tiles, program->threads);
+    for (int64_t i = 0; i < phase.shares; i++) shares[i] = (share_t){&phase, i};
+    run_shares(run_share, shares, sizeof *shares, phase.shares);
+    if (phase.shares == 1) return;
     for (const operation_t *o = first; o < last; o++) {
         if (o->kind != LINEAR_GRAD) continue;
         const linear_t *layer = program->layers + o->number;
