@@ -1,0 +1,80 @@
+"""Records what a policy sees, and compares what a microcontroller makes of it.
+
+python record.py RUN                       # writes observations.h and actions.npy
+make run | python record.py --compare      # the program's actions beside the model's
+"""
+
+import argparse
+import re
+import sys
+from pathlib import Path
+
+import numpy as np
+
+
+def header(observations: np.ndarray) -> str:
+    """A C header with a row for each observation; hexadecimal floats lose nothing."""
+    rows = observations.astype(np.float32).reshape(len(observations), -1)
+    body = ",\n".join("    {" + ", ".join(f"{float(x).hex()}f" for x in row) + "}" for row in rows)
+    return (
+        f"#define OBSERVATIONS {len(rows)}\n\n"
+        f"static const float observations[OBSERVATIONS][{rows.shape[1]}] = {{\n{body}\n}};\n"
+    )
+
+
+def record(run: Path, count: int, into: Path) -> None:
+    """Write raw observations of a run's environment, and the model's actions on them."""
+    from stable_baselines3.common.vec_env import unwrap_vec_normalize
+
+    from sb3_sparse.export import record_observations
+    from sb3_sparse.zoo.saved import SavedModel
+
+    saved = SavedModel.find(run)
+    model, envs = saved.load(), saved.evaluation_envs(count, 0)
+    seen = observations = record_observations(model, envs, count)
+    if (normalization := unwrap_vec_normalize(envs)) is not None:
+        seen = normalization.normalize_obs(observations)
+    actions, _ = model.predict(seen, deterministic=True)
+    (into / "observations.h").write_text(header(observations))
+    np.save(into / "actions.npy", actions.reshape(count, -1).astype(np.float32))
+
+
+def read(text: str) -> tuple[np.ndarray, np.ndarray, int]:
+    """Actions, ticks of each, and bytes of stack that a program printed."""
+    rows = re.findall(r"^(?:[0-9a-f]{8} )+[0-9a-f]{8}$", text, re.M)
+    stack = re.search(r"^stack ([0-9a-f]{8})$", text, re.M)
+    if stack is None:
+        sys.exit(f"the program did not get to its end; it printed last: {text[-200:]!r}")
+    numbers = np.array([[int(word, 16) for word in row.split()] for row in rows], np.uint32)
+    return numbers[:, :-1].copy().view(np.float32), numbers[:, -1], int(stack[1], 16)
+
+
+def compare(text: str, folder: Path, within: float) -> None:
+    """Print how far the actions are from the model's; exit with 1 if that is too far."""
+    actions, ticks, stack = read(text)
+    expected = np.load(folder / "actions.npy")
+    difference = np.abs(actions - expected) / np.maximum(1, np.abs(expected))
+    print(f"{len(actions)} actions differ from model.predict by {difference.max():.2g} at most")
+    print(f"{ticks.mean():.0f} ticks of the timer an action, {stack} bytes of stack")
+    if not difference.max() <= within:
+        sys.exit(f"more than {within:g}")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("run", type=Path, nargs="?", help="a run's folder")
+    parser.add_argument("--count", type=int, default=1000, help="number of observations")
+    parser.add_argument("--folder", type=Path, default=Path(), help="where the two files are")
+    parser.add_argument("--compare", action="store_true", help="read a program's output")
+    parser.add_argument("--within", type=float, default=1e-5, help="difference that is allowed")
+    args = parser.parse_args()
+    if args.compare:
+        compare(sys.stdin.read(), args.folder, args.within)
+    elif args.run is None:
+        parser.error("name a run's folder, or --compare")
+    else:
+        record(args.run, args.count, args.folder)
+
+
+if __name__ == "__main__":
+    main()
