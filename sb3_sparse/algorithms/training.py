@@ -152,6 +152,9 @@ def _check_policy(policy: BaseSparsePolicy, methods: Methods) -> None:
         raise NotCovered(f"there are no kernels: {missing}")
     if policy.device.type != "cpu":
         raise NotCovered(f"the policy is on {policy.device}")
+    for module in policy.modules():  # first: images come here before each round
+        if isinstance(module, BaseFeaturesExtractor) and not only_flattens(module):
+            raise NotCovered(f"the features extractor {type(module).__name__}")
     for name, module in policy.named_modules():
         if getattr(module, "use_sde", False):
             raise NotCovered("gSDE")
@@ -163,9 +166,6 @@ def _check_policy(policy: BaseSparsePolicy, methods: Methods) -> None:
     for name, called in methods.items():
         if overrides(policy.get_submodule(name), called):
             raise NotCovered(f"{name or 'the policy'} has methods of its own")
-    for module in policy.modules():
-        if isinstance(module, BaseFeaturesExtractor) and not only_flattens(module):
-            raise NotCovered(f"the features extractor {type(module).__name__}")
 
 
 def _is_watched(tensor: Any) -> bool:
