@@ -47,7 +47,8 @@ class Drawn:
     def __init__(self, draw, activations: list[Activation], pools: int) -> None:
         self.draw, self.activations, self.pools = draw, activations, pools
         self.channels = draw(st.integers(1, 4))
-        self.size = [draw(st.integers(1, 9)), draw(st.integers(1, 9))]
+        # Wider than the places that the kernels take at once, too.
+        self.size = [draw(st.integers(1, 9)), draw(st.integers(1, 9) | st.integers(10, 36))]
         self.shape = (self.channels, *self.size)
         self.modules: list[nn.Module] = []
         for _ in range(draw(st.integers(1, 4))):

@@ -39,8 +39,12 @@ def is_sequence(module: nn.Module) -> bool:
 
 
 def is_residual(module: nn.Module) -> bool:
-    """Whether a module adds to its input what its parts make of it."""
-    return isinstance(module, Residual) and type(module).forward is Residual.forward
+    """Whether a module adds to its input what its parts make of it, and has no others."""
+    return (
+        isinstance(module, Residual)
+        and type(module).forward is Residual.forward
+        and list(module._modules) == [module.name]
+    )
 
 
 def parts_of(path: Iterable[nn.Module]) -> list[Part] | None:

@@ -60,11 +60,12 @@ class ChainedSequential(nn.Sequential):
             y: th.Tensor = super().forward(input)  # type: ignore[no-untyped-call]
             return y
         if called != self._seen or not all(map(tells_its_slope, self._adjustable)):
-            self._seen, self._steps = called, _steps(modules)
+            self._steps = _steps(modules)
             fused = (
                 after for step, *_ in self._steps for after in getattr(step, "activations", ())
             )
             self._adjustable = [after for after in fused if isinstance(after, ADJUSTABLE)]
+            self._seen = called  # last, for other threads
         x, batch, lead = input, 0, input.shape[:-1]
         for step, tiled_in, tiled_out in self._steps:
             if not isinstance(step, Chain):

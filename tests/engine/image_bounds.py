@@ -132,7 +132,8 @@ def drawn(random, padded: bool) -> Chain:
 
     :param padded: whether there is padding; blocks have it
     """
-    chain = Chain(random, (int(random.integers(1, 4)), *map(int, random.integers(1, 9, 2))))
+    height, width = random.integers(1, (9, random.choice([9, 40])))
+    chain = Chain(random, (int(random.integers(1, 4)), int(height), int(width)))
     for _ in range(int(random.integers(2, 5))):
         kind, block = int(random.integers(2)), padded and random.random() < 0.5
         size, kernel = chain.shapes[chain.now][1:], random.integers(1, 4, 2)

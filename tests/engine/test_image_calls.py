@@ -290,8 +290,9 @@ def test_copies_between_the_passes_leave_them_alone(both, x, duplicate):
 
 def test_threads_act_and_train_at_once(both, x):
     _, sparse = both
-    sparse(x).square().sum().backward()
-    alone, expected, wrong = gradients(sparse), sparse(x).detach(), []
+    other = copy.deepcopy(sparse)  # so that each thread finds the chains for itself
+    other(x).square().sum().backward()
+    alone, expected, wrong = gradients(other), other(x).detach(), []
 
     def act() -> None:
         with th.no_grad():
@@ -311,6 +312,14 @@ def test_threads_act_and_train_at_once(both, x):
     for thread in threads:
         thread.join()
     assert wrong == []
+
+
+def test_inference_mode_leaves_nothing_behind(both, x):
+    dense, sparse = both
+    with th.inference_mode():
+        for count in (1, 17):
+            close(sparse(x[:count]), dense(x[:count]))
+    sparse(x).sum().backward()
 
 
 def test_a_result_does_not_keep_the_network(x):

@@ -105,6 +105,35 @@ def test_blocks_add_what_they_add_elsewhere(block):
     compare(*twins(nn.Hardtanh(-9.0, 9.0), block(), convolution(), whole=True), whole(3, 2, 5, 4))
 
 
+class Measured(Residual):
+    """A user's block with a module that its forward pass does not call."""
+
+    def __init__(self, *layers: nn.Module) -> None:
+        super().__init__(*layers)
+        self.probe = nn.MaxPool2d(2)
+
+
+class Halved(Residual):
+    """A user's block that adds half."""
+
+    def forward(self, x: th.Tensor) -> th.Tensor:
+        return x + 0.5 * self.get_submodule(self.name)(x)
+
+
+@pytest.mark.parametrize("kind", [Measured, Halved])
+def test_a_users_block_is_called_by_itself(kind):
+    dense, sparse = twins(convolution(), kind(nn.ReLU(), convolution()), whole=True)
+    compare(dense, sparse, whole(17, 2, 4, 6), whole=True)
+    assert chains(sparse) == [1]
+
+
+def test_a_layer_may_be_called_twice():
+    layer, block = convolution(), Residual(nn.ReLU(), convolution())
+    dense, sparse = twins(layer, nn.ReLU(), layer, block, block, whole=True)
+    compare(dense, sparse, whole(17, 2, 4, 5), whole=True)
+    assert chains(sparse) == [4]
+
+
 def test_a_slope_may_change_between_two_calls():
     after = nn.LeakyReLU(0.5)
     dense, sparse = twins(convolution(), after, convolution())
