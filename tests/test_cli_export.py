@@ -3,6 +3,7 @@ from __future__ import annotations
 import pickle
 import shutil
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -120,12 +121,30 @@ def test_a_zip_alone(monkeypatch, capsys, tmp_path):
     code, said = command(monkeypatch, capsys, "export", zip_file, tmp_path / "policy", "--int8")
     assert code == 0, said
     assert "no observations were recorded; --env ID" in said
-    assert "8-bit weights against float32" in said
+    assert "int8 against float32" in said
     code, said = command(
         monkeypatch, capsys, "export", zip_file, tmp_path / "policy", "--env", "CartPole-v1"
     )
     assert code == 0, said
     assert "1000 recorded" in said
+
+
+def test_int8_with_and_without_a_value(monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    make("DQN", policy="MlpPolicy").save("model.zip")
+    full = ["--int8", "full", "--env", "CartPole-v1"]
+    code, said = command(monkeypatch, capsys, "export", "model.zip", *full, "whole")
+    assert code == 0, said
+    assert "int8 against float32: actions differ for" in said
+    assert "of 1000 recorded observations" in said
+    assert "20 episodes with the same seeds" in said
+    assert "int16_t whole[" in Path("whole.c").read_text()
+    for words in (["--int8", "one"], ["two", "--int8"], ["three", "--int8=weights"]):
+        code, said = command(monkeypatch, capsys, "export", "model.zip", *words)
+        assert code == 0, said
+        assert "episodes" not in said
+    assert Path("one.c").read_text() == Path("two.c").read_text() == Path("three.c").read_text()
+    assert "whole[" not in Path("one.c").read_text()
 
 
 @pytest.mark.parametrize(
@@ -137,6 +156,8 @@ def test_a_zip_alone(monkeypatch, capsys, tmp_path):
             "unknown export format 'tflite'; allowed are c, numpy, onnx, dense",
         ),
         (["model.zip", "--to", "onnx", "--int8"], "int8 is for to='c' only"),
+        (["model.zip", "--int8=most"], "unknown value of int8 'most'; allowed are weights, full"),
+        (["model.zip", "--int8", "full"], "recorded observations; give observations"),
         (["model.zip", "--vecnormalize", "no.pkl"], "there is no file no.pkl; give what"),
         (["model.zip", "--algo", "sac"], "model.zip is a model of dqn, not of sac; leave --algo"),
         (["model.zip", "--algo", "dreamer"], "unknown algorithm 'dreamer'; allowed are dqn"),

@@ -13,7 +13,7 @@ try:
     from rich.console import Console
 
     from sb3_sparse.cli.compress import compress_command
-    from sb3_sparse.cli.export import export_command
+    from sb3_sparse.cli.export import ExportCommand, export_command
     from sb3_sparse.cli.look import enjoy_command, inspect_command
     from sb3_sparse.cli.study import studies
     from sb3_sparse.cli.train import train_command
@@ -33,7 +33,7 @@ app.command("train", context_settings=MORE_VALUES)(train_command)
 app.command("enjoy")(enjoy_command)
 app.command("inspect")(inspect_command)
 app.command("compress")(compress_command)
-app.command("export")(export_command)
+app.command("export", cls=ExportCommand)(export_command)
 app.add_typer(tuning, name="tune", help="Search hyperparameters with Optuna, and report.")
 app.add_typer(studies, name="study", help="Run and report whole comparisons, as the paper's.")
 

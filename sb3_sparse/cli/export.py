@@ -3,15 +3,34 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperCommand
 
 from sb3_sparse.cli.common import Best, GymPackages, ModelAlgo, ModelEnv, Statistics, option, say
 from sb3_sparse.errors import ConfigError
-from sb3_sparse.export.formats import check_format
+from sb3_sparse.export.formats import INT8, check_format, check_int8
 
 RECORDED = 1000
+
+
+class ExportCommand(TyperCommand):
+    """Takes ``--int8`` alone and ``--int8 full``; any other word after it is the next argument."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Give ``--int8`` its value before the options are read."""
+        words: list[str] = []
+        alone = False
+        for word in args:
+            if alone:
+                words[-1] = f"--int8={word if word in INT8 else INT8[0]}"
+            if not (alone and word in INT8):
+                words.append(word)
+            alone = word == "--int8"
+        if alone:
+            words[-1] = f"--int8={INT8[0]}"
+        return super().parse_args(ctx, words)
 
 
 def export_command(
@@ -22,8 +41,15 @@ def export_command(
     to: Annotated[str, option("c, numpy, onnx or dense (a zip of stock SB3).", "--to")] = "c",
     vecnormalize: Statistics = None,
     int8: Annotated[
-        bool, option("C only: weights as 8-bit numbers with a scale for each row.", "--int8")
-    ] = False,
+        str | None,
+        typer.Option(
+            "--int8",
+            help="C only: weights as 8-bit numbers with a scale for each row. --int8 full: linear "
+            "layers without floats, for processors without a float unit.",
+            metavar="[full]",
+            show_default=False,
+        ),
+    ] = None,
     best: Best = False,
     env: ModelEnv = None,
     gym_packages: GymPackages = None,
@@ -37,6 +63,7 @@ def export_command(
     The check uses random observations, and recorded ones if the environment is known.
     """
     check_format(to)
+    check_int8(int8, to)
     from sb3_sparse.export import export_policy, record_observations
     from sb3_sparse.export.write import main_file
     from sb3_sparse.zoo.saved import SavedModel
@@ -52,22 +79,25 @@ def export_command(
     if to == "dense" and main_file(out, ".zip").resolve() == saved.path.resolve():
         raise ConfigError(f"{saved.path} would be overwritten by its own export; give another name")
     loaded = saved.load()
-    observations = None
+    observations = envs = None
     if saved.env_id is not None:
         envs = saved.evaluation_envs(RECORDED, 0)
-        try:
+    try:
+        if envs is not None:
             observations = record_observations(loaded, envs, RECORDED)
-        finally:
+        report = export_policy(
+            loaded,
+            out,
+            to,
+            vecnormalize=saved.vecnormalize,
+            observations=observations,
+            int8=int8 or False,
+            eval_env=envs if int8 == "full" else None,
+            force=force,
+        )
+    finally:
+        if envs is not None:
             envs.close()
-    report = export_policy(
-        loaded,
-        out,
-        to,
-        vecnormalize=saved.vecnormalize,
-        observations=observations,
-        int8=int8,
-        force=force,
-    )
     say(report)
     if observations is None:
         say("note: no observations were recorded; --env ID compares the policies on an environment")

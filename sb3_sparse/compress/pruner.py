@@ -12,7 +12,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 
-from sb3_sparse.compress.evaluation import episode_returns
+from sb3_sparse.analysis.evaluation import episode_returns
 from sb3_sparse.compress.finetune import fill_buffer, fine_tune
 from sb3_sparse.compress.twin import load_beside, sparse_policy, sparsify, sparsity_of
 from sb3_sparse.engine.network import SparseNetwork

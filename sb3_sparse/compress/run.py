@@ -10,7 +10,7 @@ from typing import Any
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
-from sb3_sparse.compress.evaluation import check_eval_env
+from sb3_sparse.analysis.evaluation import check_eval_env
 from sb3_sparse.compress.guard import change, mean_interval
 from sb3_sparse.compress.pruner import ModelPruner
 from sb3_sparse.compress.record import CompressionRecord, fingerprint, open_record

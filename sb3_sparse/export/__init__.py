@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from sb3_sparse.lazy import lazily
 
 if TYPE_CHECKING:
+    from sb3_sparse.export.effect import Returns
     from sb3_sparse.export.formats import FORMATS
     from sb3_sparse.export.observations import record_observations
     from sb3_sparse.export.parity import Parity, ParityError
@@ -17,6 +18,7 @@ __all__ = [
     "ExportReport",
     "Parity",
     "ParityError",
+    "Returns",
     "export_policy",
     "record_observations",
 ]

@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 from sb3_sparse.export import ckernels
 from sb3_sparse.export.cfunctions import FUNCTIONS
 from sb3_sparse.export.cheader import PROTOTYPE, WIDTH, about, declarations
+from sb3_sparse.export.cintegers import integer_call
 from sb3_sparse.export.graph import Graph
+from sb3_sparse.export.integers import IntegerLinear, Lookup, Quantize
 from sb3_sparse.export.layout import grouped, side_by_side
 from sb3_sparse.export.memory import Memory, bordered_shape, plan_memory
 from sb3_sparse.export.nodes import (
@@ -36,7 +38,15 @@ from sb3_sparse.export.nodes import (
 )
 from sb3_sparse.export.quantize import quantize_rows
 
-BYTES = {"float": 4, "int8_t": 1, "uint16_t": 2, "uint32_t": 4}
+BYTES = {
+    "float": 4,
+    "int8_t": 1,
+    "uint8_t": 1,
+    "int16_t": 2,
+    "uint16_t": 2,
+    "int32_t": 4,
+    "uint32_t": 4,
+}
 
 
 @dataclass(frozen=True)
@@ -68,8 +78,9 @@ def write_c(graph: Graph, version: str, int8: bool = False) -> CSource:
     tables = "\n".join(writer.tables)
     functions = "\n".join(writer.functions.values())
     body = "\n".join(f"    {line}" for line in writer.calls)
-    ram = 4 * writer.memory.size
-    memory = f"static float memory[{writer.memory.size}];\n\n" if ram else ""
+    ram = writer.memory.bytes
+    arrays = {"float memory": writer.memory.size, "int16_t whole": writer.memory.whole}
+    memory = "".join(f"static {name}[{size}];\n\n" for name, size in arrays.items() if size)
     comment = about(graph, version, writer.flash, ram)
     includes = "#include <stdint.h>\n"
     if any(f"{name}(" in functions for name in ckernels.MATH):
@@ -102,6 +113,10 @@ class _Writer:
             self._linear(node, x, y)
         elif isinstance(node, Conv):
             self._conv(node, x, y)
+        elif isinstance(node, (Quantize, IntegerLinear, Lookup)):
+            name, arguments, sources = integer_call(node, self._table)
+            self.functions |= sources
+            self._call(name, x, y, *arguments, source=sources[name])
         elif isinstance(node, MaxPool):
             self._max_pool(node, x, y)
         elif isinstance(node, (Argmax, OneHot)):
@@ -243,7 +258,8 @@ class _Writer:
             node = self.graph.nodes[value - 1]
             before = self._place(node.inputs[0])
             return f"{before} + {node.start}" if isinstance(node, Slice) else before
-        return f"memory + {self.memory.places[value]}"
+        array = "whole" if self.graph.nodes[value - 1].whole else "memory"
+        return f"{array} + {self.memory.places[value]}"
 
     def _table(self, name: str, numbers: Any, kind: str) -> str:
         """Append a constant array and return its name."""

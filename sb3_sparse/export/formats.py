@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from sb3_sparse.errors import check_choice
+from sb3_sparse.errors import ConfigError, check_choice
 
 FORMATS = ("c", "numpy", "onnx", "dense")
+INT8 = ("weights", "full")
+"""What 8-bit weights may be combined with: float32 values, or whole numbers throughout."""
 
 
 def check_format(to: object) -> None:
@@ -13,3 +15,19 @@ def check_format(to: object) -> None:
     :raises ConfigError: if ``to`` is not one of :data:`FORMATS`
     """
     check_choice("export format", to, FORMATS)
+
+
+def check_int8(int8: object, to: str) -> str | None:
+    """Return what is stored as 8-bit numbers; None: nothing.
+
+    :param int8: one of :data:`INT8`, True for ``"weights"``, False or None for nothing
+    :param to: the format
+    :raises ConfigError: for another value, or a format that has no 8-bit weights
+    """
+    if int8 is None or int8 is False:
+        return None
+    chosen = "weights" if int8 is True else int8
+    check_choice("value of int8", chosen, INT8)
+    if to != "c":
+        raise ConfigError(f"int8 is for to='c' only, got to={to!r}")
+    return str(chosen)

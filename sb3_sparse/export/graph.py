@@ -61,7 +61,7 @@ class Graph:
     @property
     def nnz(self) -> int:
         """Number of connections that are not 0."""
-        return sum(layer.nnz for layer in self.layers)
+        return sum(node.nnz for node in self.nodes)
 
     def shape_of(self, value: int) -> tuple[int, ...]:
         """Return the shape of a value; value 0 is the observation."""

@@ -1,12 +1,13 @@
-"""Plans one static array for all values of a graph, which share it as far as possible."""
+"""Plans the static arrays of a graph's values, which share them as far as possible."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from sb3_sparse.export.graph import Graph
+from sb3_sparse.export.integers import Lookup
 from sb3_sparse.export.nodes import (
     Activation,
     Add,
@@ -20,22 +21,49 @@ from sb3_sparse.export.nodes import (
     Standardize,
 )
 
-IN_PLACE = (Activation, PerUnit, Standardize, Add, Multiply)
+IN_PLACE = (Activation, PerUnit, Standardize, Add, Multiply, Lookup)
 """Nodes that may overwrite an input that nothing reads later."""
 
 
 @dataclass(frozen=True)
 class Memory:
-    """The layout of the array.
+    """The layout of an array of floats, and one of 16-bit whole numbers.
 
     :param size: number of floats
-    :param places: index of the first float of each value in the array, by the value's number
+    :param places: index of the first element of each value in its array, by the value's number
     :param borders: index of the first float of bordered copies of inputs, by the node's result
+    :param whole: number of whole numbers
     """
 
     size: int
     places: dict[int, int]
     borders: dict[int, int]
+    whole: int = 0
+
+    @property
+    def bytes(self) -> int:
+        """Bytes of both arrays."""
+        return 4 * self.size + 2 * self.whole
+
+
+@dataclass
+class _Array:
+    """An array in which values are placed first-fit."""
+
+    size: int = 0
+    taken: list[tuple[int, int, int]] = field(default_factory=list)
+    """Start, end and last use of values."""
+
+    def place(self, length: int, until: int, now: int) -> int:
+        start = 0
+        self.taken = sorted(entry for entry in self.taken if entry[2] >= now)
+        for begin, end, _ in self.taken:
+            if start + length <= begin:
+                break
+            start = max(start, end)
+        self.taken.append((start, start + length, until))
+        self.size = max(self.size, start + length)
+        return start
 
 
 def bordered_shape(node: Node, shape: tuple[int, ...]) -> tuple[int, ...] | None:
@@ -59,30 +87,17 @@ def plan_memory(graph: Graph) -> Memory:
             last_use[home[taken]] = value
     places: dict[int, int] = {}
     borders: dict[int, int] = {}
-    taken_now: list[tuple[int, int, int]] = []  # start, end, last use
-    size = 0
-
-    def place(length: int, until: int, now: int) -> int:
-        nonlocal size
-        start = 0
-        taken_now[:] = sorted(entry for entry in taken_now if entry[2] >= now)
-        for begin, end, _ in taken_now:
-            if start + length <= begin:
-                break
-            start = max(start, end)
-        taken_now.append((start, start + length, until))
-        size = max(size, start + length)
-        return start
-
+    floats, whole = _Array(), _Array()
     for value, node in enumerate(graph.nodes, start=1):
         border = bordered_shape(node, graph.shape_of(node.inputs[0]))
         if border is not None:
-            borders[value] = place(int(np.prod(border)), value, value)
+            borders[value] = floats.place(int(np.prod(border)), value, value)
         if home[value] == value and value != last_value:
-            places[value] = place(int(np.prod(node.shape)), last_use[value], value)
+            array = whole if node.whole else floats
+            places[value] = array.place(int(np.prod(node.shape)), last_use[value], value)
         elif home[value] in places:
             places[value] = places[home[value]]
-    return Memory(size, places, borders)
+    return Memory(floats.size, places, borders, whole.size)
 
 
 def _homes(graph: Graph) -> list[int]:

@@ -25,6 +25,13 @@ class Node:
     inputs: tuple[int, ...]
     shape: tuple[int, ...]
     op: ClassVar[str]
+    whole: ClassVar[bool] = False
+    """Whether the result is 16-bit whole numbers."""
+
+    @property
+    def nnz(self) -> int:
+        """Number of connections that are not 0."""
+        return 0
 
     @property
     def name(self) -> str:

@@ -96,19 +96,31 @@ def record_observations(model: BaseAlgorithm, env: VecEnv, count: int) -> Observ
     try:
         observation: Any = env.reset()
         for _ in range(-(-count // env.num_envs)):
-            found.append(observation if normalization is None else _raw(normalization, observation))
+            found.append(raw_of(normalization, observation, model.observation_space))
             action, _ = model.predict(observation, deterministic=True)
             observation, _, _, _ = env.step(action)
     finally:
         if normalization is not None:
             normalization.training = training
-    space = model.observation_space
+    if isinstance(model.observation_space, spaces.Dict):
+        keys = model.observation_space.spaces
+        return {key: np.concatenate([part[key] for part in found])[:count] for key in keys}
+    return np.concatenate(found)[:count]
+
+
+def raw_of(
+    normalization: VecNormalize | None, seen: Observations, space: spaces.Space[Any]
+) -> Observations:
+    """Return the observations that an exported policy takes, given what an environment shows.
+
+    :param normalization: the environment's own, which holds its latest raw observations
+    :param seen: its latest observations
+    :param space: the policy's observation space, whose images have their channels first
+    """
+    raw = seen if normalization is None else _raw(normalization, seen)
     if isinstance(space, spaces.Dict):
-        return {
-            key: np.concatenate([maybe_transpose(part[key], sub) for part in found])[:count]
-            for key, sub in space.spaces.items()
-        }
-    return np.concatenate([maybe_transpose(part, space) for part in found])[:count]
+        return {key: maybe_transpose(raw[key], part) for key, part in space.spaces.items()}
+    return maybe_transpose(raw, space)
 
 
 def _fits(shown: Any, taken: Any) -> bool:

@@ -54,8 +54,9 @@ class Parity:
         return self.different == 0 if self.discrete else self.difference <= TOLERANCE
 
     def __str__(self) -> str:
-        recorded = f"{self.recorded} recorded and " if self.recorded else ""
-        seen = f"{recorded}{self.random} random observations"
+        counts = {"recorded": self.recorded, "random": self.random}
+        seen = " and ".join(f"{count} {kind}" for kind, count in counts.items() if count)
+        seen = f"{seen or 'no'} observations"
         if self.discrete:
             return f"actions differ for {self.different} of {seen}"
         return f"largest difference {self.difference:.1e} on {seen}"
@@ -65,13 +66,14 @@ def compare(
     model: Actor,
     exported: Actor,
     recorded: Observations | None,
-    random: Observations,
+    random: Observations | None,
     discrete: bool,
     span: NDArray[Any] | float = 0.0,
 ) -> Parity:
     """Run both policies on all observations.
 
     :param recorded: observations recorded in an environment; None: none
+    :param random: random observations; None: none
     :param span: see :class:`Parity`, shape ``(actions,)``; rounding errors grow with it
     """
     difference, different, worst = 0.0, 0, None

@@ -10,14 +10,16 @@ from pathlib import Path
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from torch import nn
 
 from sb3_sparse.errors import ConfigError, MissingExtra, UnsupportedError
 from sb3_sparse.export.artifact import GRAPH_ARTIFACTS, Artifact, dense_artifact, predictor
+from sb3_sparse.export.calibrate import integer_graph
+from sb3_sparse.export.effect import Returns, play_both
 from sb3_sparse.export.extract import check_model, graph_of, span_of
 from sb3_sparse.export.fold import fold
-from sb3_sparse.export.formats import check_format
+from sb3_sparse.export.formats import check_format, check_int8
 from sb3_sparse.export.graph import Graph
 from sb3_sparse.export.nodes import Argmax
 from sb3_sparse.export.observations import (
@@ -44,7 +46,8 @@ class ExportReport:
 
     :param files: the files and their sizes in bytes
     :param parity: how closely the export acts as the model; None: not checked
-    :param rounding: how much 8-bit weights change the actions; None: weights are float32
+    :param rounding: how much 8-bit numbers change the actions; None: there are none
+    :param returns: what they do to the return; None: not played
     :param sizes: bytes needed where the policy runs, by kind (``"flash"``, ``"RAM"``)
     :param notes: what the user must know
     :param nnz: connections of the acting network that are not 0; for ``"dense"``, of all networks
@@ -73,6 +76,7 @@ class ExportReport:
     dense_bytes: int = 0
     removed_units: int = 0
     units: int = 0
+    returns: Returns | None = None
 
     def __str__(self) -> str:
         lines = [f"{path}: {size:,} bytes" for path, size in self.files.items()]
@@ -87,7 +91,9 @@ class ExportReport:
             lines.append(f"connections that are not 0: {self.nnz:,}")
         lines.append(f"parity: {'not checked' if self.parity is None else self.parity}")
         if self.rounding is not None:
-            lines.append(f"8-bit weights against float32: {self.rounding}")
+            lines.append(f"int8 against float32: {self.rounding}")
+        if self.returns is not None:
+            lines.append(f"return: {self.returns}")
         return "\n".join([*lines, *(f"note: {note}" for note in self.notes)])
 
 
@@ -98,7 +104,8 @@ def export_policy(
     *,
     vecnormalize: VecNormalize | str | Path | None = None,
     observations: Observations | None = None,
-    int8: bool = False,
+    int8: bool | str = False,
+    eval_env: VecEnv | None = None,
     force: bool = False,
 ) -> ExportReport:
     """Write a model's deterministic policy in another form, and check that it acts the same.
@@ -114,8 +121,12 @@ def export_policy(
         VecNormalize of the model's own environment, if there is one
     :param observations: recorded observations for the check, raw, of shape ``(count, *shape)`` as
         the policy sees them (images channels first), or a dict of such; random ones are always used
-    :param int8: for C only: store weights as 8-bit numbers with a scale for each row. The check
-        then compares with the rounded weights, and the report tells how rounding changes actions
+    :param int8: for C only: ``"weights"`` (or True) stores weights as 8-bit numbers with a scale
+        for each row; ``"full"`` also lets linear layers and activations compute with whole numbers
+        alone, for processors without a float unit, in ranges twice those of ``observations``. The
+        check then compares with the rounded policy, and the report tells how actions change
+    :param eval_env: for ``int8``: environments with the model's wrappers, in which the model and
+        the exported policy play 20 episodes each for the report
     :param force: write the files even if the check fails or cannot run
     :raises ConfigError: for a value that is not allowed
     :raises UnsupportedError: for an algorithm, network or space that cannot be exported, or if
@@ -127,8 +138,14 @@ def export_policy(
         if any discrete action differs
     """
     check_format(to)
-    if int8 and to != "c":
-        raise ConfigError(f"int8 is for to='c' only, got to={to!r}")
+    bits = check_int8(int8, to)
+    if bits == "full" and observations is None:
+        raise ConfigError(
+            "int8='full' takes the ranges of its whole numbers from recorded observations; give "
+            "observations (record_observations makes them), or on the command line --env ID"
+        )
+    if eval_env is not None and bits is None:
+        raise ConfigError("eval_env shows what int8 does to the return; give int8, too")
     check_model(model)
     space = model.observation_space
     normalization = normalization_of(model, vecnormalize)
@@ -136,7 +153,7 @@ def export_policy(
         check_recorded(observations, space)
     if to == "dense":
         artifact = dense_artifact(model, normalization is not None)
-        normalization = exact = rounded = None  # a zip of SB3 does not normalise by itself
+        normalization = written = rounded = None  # a zip of SB3 does not normalise by itself
         nnz = _connections(model)
         counts = {"nnz": nnz, "exported_nnz": nnz}
     else:
@@ -144,21 +161,18 @@ def export_policy(
             check_statistics(space, normalization)
         raw = graph_of(model, normalization)
         exact = remove_dead_units(fold(raw))
-        artifact = GRAPH_ARTIFACTS[to](exact, int8)
-        rounded = quantized(exact).run if int8 else None
+        written = integer_graph(exact, observations) if bits == "full" else exact
+        artifact = GRAPH_ARTIFACTS[to](written, bits is not None)
+        rounded = quantized(written).run if bits else None
         counts = _counts(raw, exact)
     path = main_file(Path(path), next(iter(artifact.files)))
     checked = partial(
-        compare,
-        recorded=observations,
-        random=random_observations(
-            space, normalization, RANDOM_IMAGES if has_images(space) else RANDOM
-        ),
-        discrete=not isinstance(model.action_space, spaces.Box),
-        span=span_of(model),
+        compare, discrete=not isinstance(model.action_space, spaces.Box), span=span_of(model)
     )
+    count = RANDOM_IMAGES if has_images(space) else RANDOM
+    random = random_observations(space, normalization, count)
     own, notes = predictor(model, normalization), list(artifact.notes)
-    parity = rounding = None
+    parity = rounding = returns = None
     try:
         actor = artifact.actor()
     except (UnsupportedError, MissingExtra) as error:
@@ -166,20 +180,25 @@ def export_policy(
             raise
         notes.append(f"written unchecked, as you asked: {error}")
     else:
-        parity = checked(rounded or own, actor)
-        rounding = checked(own, actor) if rounded else None
+        parity = checked(rounded or own, actor, observations, random)
+        if rounded:  # whole numbers have the ranges of recorded observations
+            met = None if bits == "full" else random
+            rounding = checked(own, actor, observations, met)
     if parity is not None and not parity.holds:
-        failure = _failure(parity, exact)
+        failure = _failure(parity, written)
         if not force:
             raise ParityError(
                 f"the export to {to!r} does not act as the model: {failure}. Nothing was written; "
                 "--force (force=True) writes it all the same"
             )
         notes.append(f"written although it does not act as the model, as you asked: {failure}")
+    if eval_env is not None and rounding is not None:
+        returns = play_both(own, actor, eval_env, space, model.action_space)
     return ExportReport(
         files=_write(artifact, path),
         parity=parity,
         rounding=rounding,
+        returns=returns,
         sizes=artifact.sizes,
         notes=tuple(notes),
         **counts,

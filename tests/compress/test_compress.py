@@ -17,9 +17,9 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from support import assert_masked, make
 
 from sb3_sparse import sparsify
+from sb3_sparse.analysis.evaluation import check_eval_env, episode_returns
 from sb3_sparse.compress import compress_model, finetune
 from sb3_sparse.compress import pruner as pruner_module
-from sb3_sparse.compress.evaluation import check_eval_env, episode_returns
 from sb3_sparse.errors import ConfigError, CorruptStateError
 
 QUICK = dict(steps=64, episodes=4, seed=3)

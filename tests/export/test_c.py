@@ -18,9 +18,13 @@ from sb3_sparse.export.graph import Graph
 from sb3_sparse.export.layout import grouped
 from sb3_sparse.export.memory import plan_memory
 from sb3_sparse.export.nodes import Add, Conv, Flatten
+from sb3_sparse.export.observations import random_observations
 from sb3_sparse.export.quantize import quantize_rows, quantized
 
-BYTES = {"float": 4, "int8_t": 1, "uint16_t": 2, "uint32_t": 4}
+BYTES = {
+    **{"float": 4, "int32_t": 4, "uint32_t": 4, "int16_t": 2, "uint16_t": 2},
+    **{"int8_t": 1, "uint8_t": 1},
+}
 
 
 def policies():
@@ -46,6 +50,11 @@ def models():
 KINDS = ["vectors", "dense", "images", "residual", "simba"]
 
 
+def some(model):
+    """A few observations of a model."""
+    return random_observations(model.observation_space, None, 20)
+
+
 def works(*options):
     """Whether the compiler can do without errors what a file for it would need."""
     code = "#include <math.h>\n#include <stdint.h>\nextern float f;\n"
@@ -54,24 +63,26 @@ def works(*options):
 
 
 @pytest.mark.parametrize("options", [["-O2"], ["-O3", "-Wconversion"], ["-m32", "-O2"]], ids=str)
-@pytest.mark.parametrize("int8", [False, True])
+@pytest.mark.parametrize("int8", [False, True, "full"])
 @pytest.mark.parametrize("kind", KINDS)
 def test_no_compiler_warns(models, kind, int8, options, tmp_path):
     if not works(*options):
         pytest.skip(f"the compiler cannot {options[0]} here (Debian: gcc-multilib)")
-    export_policy(models[kind], tmp_path / "policy", "c", int8=int8)
+    export_policy(models[kind], tmp_path / "policy", int8=int8, observations=some(models[kind]))
     assert compiles(tmp_path / "policy.c", *options) == ""
 
 
-@pytest.mark.parametrize("int8", [False, True])
+@pytest.mark.parametrize("int8", [False, True, "full"])
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_file_states_its_flash_and_ram(models, kind, int8, tmp_path):
-    report = export_policy(models[kind], tmp_path / "policy", "c", int8=int8)
+    seen = some(models[kind])
+    report = export_policy(models[kind], tmp_path / "policy", int8=int8, observations=seen)
     source = (tmp_path / "policy.c").read_text()
     arrays = re.findall(r"static const (\w+) \w+\[(\d+)\] = \{(.*?)\}", source, re.S)
     assert all(len(numbers.split(",")) == int(size) for _, size, numbers in arrays)
     flash = sum(BYTES[name] * int(size) for name, size, _ in arrays)
-    ram = 4 * sum(map(int, re.findall(r"^static float memory\[(\d+)\]", source, re.M)))
+    static = re.findall(r"^static (\w+) (?:memory|whole)\[(\d+)\];", source, re.M)
+    ram = sum(BYTES[name] * int(size) for name, size in static)
     assert report.sizes == {"flash": flash, "RAM": ram}
     assert f"Flash: {flash} bytes" in source
     assert f"RAM: {ram} bytes" in source

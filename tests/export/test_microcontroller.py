@@ -16,12 +16,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from export.test_c import BYTES
-from export.tools import Task
+from export.tools import Task, random_chain
 from gymnasium import spaces
 from support import TinyImages, make
 
 from sb3_sparse import cli
 from sb3_sparse.export import export_policy
+from sb3_sparse.export.c import write_c
+from sb3_sparse.export.calibrate import integer_graph
 from sb3_sparse.export.extract import graph_of
 from sb3_sparse.export.observations import random_observations
 from sb3_sparse.export.quantize import quantized
@@ -114,6 +116,42 @@ def test_eight_bit_weights_act_on_a_board_as_the_rounded_weights_do(board, tmp_p
     np.testing.assert_allclose(said.actions, expected, atol=1e-5)
     floats, _ = model.predict(observations, deterministic=True)
     assert np.abs(said.actions - floats).max() > 1e-5
+
+
+@needs_board
+@pytest.mark.parametrize("board", BOARDS)
+def test_whole_numbers_are_the_same_on_every_board(board, tmp_path):
+    random = np.random.default_rng(6)
+    graph = random_chain(random, [9, 64, 300, 4], 0.2)
+    observations = random.normal(size=(COUNT, 9)).astype(np.float32)
+    whole = integer_graph(graph, observations[:100])
+    written = write_c(whole, "0", int8=True)
+    (tmp_path / "policy.c").write_text(written.source)
+    (tmp_path / "policy.h").write_text(written.header)
+    said = run_on(board, tmp_path, 3 * observations)
+    np.testing.assert_array_equal(said.actions, whole.run(3 * observations))
+    static = [size for name, size in sections(said.build).items() if name.startswith(".bss")]
+    assert sum(static) == written.ram
+    assert said.stack < STACK
+
+
+@needs_board
+def test_whole_numbers_need_an_eighth_of_the_instructions_without_a_float_unit(tmp_path):
+    random = np.random.default_rng(7)
+    graph = random_chain(random, [17, 64, 64, 6], 0.2)
+    observations = random.normal(size=(20, 17)).astype(np.float32)
+    ticks = {}
+    for name, policy, int8 in (
+        ("floats", graph, False),
+        ("whole", integer_graph(graph, observations), True),
+    ):
+        written = write_c(policy, "0", int8)
+        folder = tmp_path / name
+        folder.mkdir()
+        (folder / "policy.c").write_text(written.source)
+        (folder / "policy.h").write_text(written.header)
+        ticks[name] = run_on("m0", folder, observations).ticks.mean()
+    assert ticks["whole"] * 8 < ticks["floats"]  # both sparse: counted, not timed
 
 
 @needs_board

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import torch as th
 from stable_baselines3.common.atari_wrappers import EpisodicLifeEnv
-from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_sparse.errors import ConfigError
@@ -34,13 +34,14 @@ def check_eval_env(env: VecEnv) -> None:
 
 
 def episode_returns(
-    model: BaseAlgorithm, env: VecEnv, episodes: int, seed: int, deterministic: bool
+    model: PolicyPredictor, env: VecEnv, episodes: int, seed: int, deterministic: bool
 ) -> list[float]:
     """Play episodes and return their undiscounted returns.
 
     Each environment plays equally many, so that short episodes are not favoured. As in SB3, a
     Monitor's returns count if there is one. The state of torch's generator does not change.
 
+    :param model: a model, or anything else that predicts actions as one does
     :param episodes: number of episodes, rounded up to a multiple of the number of environments
     :param seed: seed of the environments and of sampled actions
     :param deterministic: whether the policy acts deterministically
@@ -50,7 +51,8 @@ def episode_returns(
     returns = np.zeros((rounds, env.num_envs))
     played = np.zeros(env.num_envs, dtype=np.int64)
     running = np.zeros(env.num_envs)
-    devices = [model.device] if model.device.type == "cuda" else []
+    device = getattr(model, "device", th.device("cpu"))
+    devices = [device] if device.type == "cuda" else []
     with th.random.fork_rng(devices=devices):
         th.manual_seed(seed)
         env.seed(seed)
