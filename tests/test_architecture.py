@@ -54,6 +54,7 @@ EDGES = {
     "sqlalchemy": {"tuning"},
     "plotly": {"tuning"},
     "ruamel": {"tuning"},
+    "sbx": {"loading"},
 }
 FILES = sorted(PACKAGE.rglob("*.py"))
 

@@ -31,6 +31,7 @@ from sb3_sparse.export.observations import (
 )
 from sb3_sparse.export.parity import TOLERANCE, Parity, ParityError, compare
 from sb3_sparse.export.quantize import quantized
+from sb3_sparse.export.sbx import NOT_CARRIED, as_sb3, is_sbx_model
 from sb3_sparse.export.units import remove_dead_units, units_of
 from sb3_sparse.loading.statistics import read_statistics
 from sb3_sparse.policies.compiled import unwrapped
@@ -114,7 +115,7 @@ def export_policy(
     ONNX model. These three take a raw observation to an action, including normalisation and
     rescaling, and leave out dead units. ``"dense"`` writes a zip of stock SB3.
 
-    :param model: a model of a supported algorithm, sparse or stock
+    :param model: a model of a supported algorithm, sparse or stock, or of SBX (SB3 in JAX)
     :param path: the file to write; its suffix may be left out
     :param to: ``"c"``, ``"numpy"``, ``"onnx"`` or ``"dense"``
     :param vecnormalize: what normalised the observations, or the file it was saved to; None: the
@@ -146,9 +147,12 @@ def export_policy(
         )
     if eval_env is not None and bits is None:
         raise ConfigError("eval_env shows what int8 does to the return; give int8, too")
+    given = model
+    if is_sbx_model(given):
+        model = as_sb3(given, whole=to == "dense")
     check_model(model)
     space = model.observation_space
-    normalization = normalization_of(model, vecnormalize)
+    normalization = normalization_of(given, vecnormalize)
     if observations is not None:
         check_recorded(observations, space)
     if to == "dense":
@@ -171,7 +175,9 @@ def export_policy(
     )
     count = RANDOM_IMAGES if has_images(space) else RANDOM
     random = random_observations(space, normalization, count)
-    own, notes = predictor(model, normalization), list(artifact.notes)
+    own, notes = predictor(given, normalization), list(artifact.notes)
+    if to == "dense" and model is not given:
+        notes.append(NOT_CARRIED)
     parity = rounding = returns = None
     try:
         actor = artifact.actor()

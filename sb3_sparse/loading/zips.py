@@ -15,6 +15,7 @@ from stable_baselines3.common.save_util import load_from_zip_file
 
 from sb3_sparse.errors import ConfigError, CorruptStateError, Diverged
 from sb3_sparse.loading.guard import reading
+from sb3_sparse.loading.sbx import is_sbx, unsupported
 
 WHAT = "model saved by SB3"
 CURE = "give a model saved by SB3, e.g. model.zip, or an earlier checkpoint"
@@ -40,6 +41,7 @@ def look_into(path: Path) -> Contents:
 
     :raises ConfigError: if the file cannot be opened
     :raises CorruptStateError: if the file is not a model
+    :raises UnsupportedError: if SBX saved the file
     """
     _check_file(path)
     with reading(path, WHAT, CURE), zipfile.ZipFile(path) as archive:
@@ -64,6 +66,7 @@ def read_model(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
 
     :raises ConfigError: if the file cannot be opened
     :raises CorruptStateError: if the file is not a model
+    :raises UnsupportedError: if SBX saved the file
     """
     _check_file(path)
     with reading(path, WHAT, CURE):
@@ -126,6 +129,8 @@ def check_finite(state: Mapping[str, Any], where: str) -> None:
 def _check_file(path: Path) -> None:
     if not path.is_file():
         raise ConfigError(f"there is no file {path}; {CURE}")
+    if is_sbx(path):
+        raise unsupported(path)
 
 
 def _checked(path: Path, state: Any) -> dict[str, Any]:

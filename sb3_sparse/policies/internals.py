@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import RolloutBuffer
@@ -67,6 +68,17 @@ def samples(buffer: RolloutBuffer, rows: Any) -> RolloutBufferSamples:
 def wrapped(env: VecEnv) -> VecEnv:
     """The environment as an algorithm sees it."""
     return BaseAlgorithm._wrap_env(env, verbose=0, monitor_wrapper=False)
+
+
+def build_networks(model: BaseAlgorithm) -> None:
+    """Make the networks of a model that was made without its setup, and no replay buffer.
+
+    The global random generators are left as they are.
+    """
+    model.replay_buffer = object()  # type: ignore[attr-defined]  # or SB3 makes one
+    with th.random.fork_rng(devices=[]):
+        model._setup_model()
+    model.replay_buffer = None  # type: ignore[attr-defined]
 
 
 def space_of(extractor: BaseFeaturesExtractor) -> spaces.Space[Any]:

@@ -10,6 +10,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_sparse.errors import ConfigError
+from sb3_sparse.loading.sbx import is_sbx, read_attributes
 from sb3_sparse.loading.statistics import load_statistics
 from sb3_sparse.loading.zips import read_model
 from sb3_sparse.policies.internals import LAST_SEEN
@@ -92,7 +93,7 @@ def _check_lone(path: Path, algo: str) -> None:
                 "observations of this model, else move it elsewhere"
             )
     if issubclass(algorithms()[algo], OnPolicyAlgorithm):
-        data, _ = read_model(path)
+        data = read_attributes(path) if is_sbx(path) else read_model(path)[0]
         if differ(*map(data.get, LAST_SEEN[:2])):
             raise ConfigError(
                 f"{path} was trained with VecNormalize; give its statistics with --vecnormalize "

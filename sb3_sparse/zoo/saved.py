@@ -15,6 +15,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecFrameStack
 
 from sb3_sparse.errors import ConfigError, CorruptStateError, MissingExtra, SparsityError
 from sb3_sparse.loading.guard import reading
+from sb3_sparse.loading.sbx import is_sbx, load_sbx
 from sb3_sparse.loading.text import read_text
 from sb3_sparse.loading.zips import check_state, look_into, read_model
 from sb3_sparse.loading.zooyaml import NotBuilt
@@ -136,7 +137,11 @@ class SavedModel:
         :raises CorruptStateError: if the file is damaged or of another algorithm, or if masks and
             weights in it disagree
         :raises Diverged: if a network is not finite
+        :raises UnsupportedError: for a model of SBX, if it is to continue training
+        :raises MissingExtra: for a model of SBX, if that is not installed
         """
+        if env is None and is_sbx(self.path):
+            return load_sbx(self.path, self.algo)
         check_state(look_into(self.path).state, str(self.path))
         if env is not None:
             data, _ = read_model(self.path)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from sb3_sparse.errors import ConfigError
+from sb3_sparse.errors import ConfigError, MissingExtra
+from sb3_sparse.loading.sbx import is_sbx, sbx_algorithms
 from sb3_sparse.loading.zips import read_model
 from sb3_sparse.policies.registry import possible_algorithms
 from sb3_sparse.zoo.spec import algorithms
@@ -17,7 +18,13 @@ def algos_of(path: Path) -> list[str]:
     likeliest.
 
     :raises ConfigError: if the zip is not a model, or of an unsupported algorithm
+    :raises MissingExtra: if SBX saved it, with an algorithm whose SB3 counterpart is not installed
     """
+    if is_sbx(path):
+        found = sbx_algorithms(path)
+        if found[0] not in algorithms():
+            raise MissingExtra(f"a model of SBX's {found[0].upper()}", "contrib")
+        return found
     data, _ = read_model(path)
     policy = data.get("policy_class")
     found = possible_algorithms(policy, data) if isinstance(policy, type) else []
