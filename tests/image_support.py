@@ -87,7 +87,7 @@ def convolutions(network: nn.Module) -> Iterator[nn.Conv2d]:
 
 def chains(network: ChainedSequential) -> list[int]:
     """Steps of each chain of a network that has been called."""
-    return [len(step.steps) for step, *_ in network._steps if isinstance(step, ImageChain)]
+    return [len(step.steps) for step, *_ in network._split.steps if isinstance(step, ImageChain)]
 
 
 def close(ours: th.Tensor | None, theirs: th.Tensor | None, usual: float = 1e-2) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch as th
 from torch import nn
@@ -22,16 +22,38 @@ ELEMENTWISE = (*ACTIVATIONS, nn.Identity)
 """Activations that work on tiles unchanged."""
 
 
+class Split(NamedTuple):
+    """The chains of a ``Sequential``, for as long as its modules stay the same.
+
+    :param called: the modules that it was made for
+    :param steps: chains and other modules, and whether a chain's input and output are tiles
+    :param adjustable: activations within the chains whose parameters the user may change
+    """
+
+    called: tuple[nn.Module, ...]
+    steps: list[tuple[Any, bool, bool]]
+    adjustable: list[nn.Module]
+
+    @classmethod
+    def of(cls, modules: Sequence[nn.Module], called: tuple[nn.Module, ...]) -> Split:
+        """Split modules that are called in turn, and may call others."""
+        steps = _steps(modules)
+        fused = (after for step, *_ in steps for after in getattr(step, "activations", ()))
+        return cls(called, steps, [after for after in fused if isinstance(after, ADJUSTABLE)])
+
+    def fits(self, called: tuple[nn.Module, ...]) -> bool:
+        """Whether the modules and their settings are those that it was made for."""
+        return called == self.called and all(map(tells_its_slope, self.adjustable))
+
+
 class ChainedSequential(nn.Sequential):
     """A ``Sequential`` that runs its sparse layers, also those of residual blocks, as chains.
 
     With hooks on its modules, and under tracing, it calls the modules one by one, as torch does.
     """
 
-    _seen: tuple[nn.Module, ...]
-    _steps: list[tuple[Any, bool, bool]]
-    _adjustable: list[nn.Module]
-    """Activations within the chains whose parameters the user may change."""
+    _split: Split | None = None
+    """Read once and written last: other threads may act meanwhile."""
     _kept: KeptInference
 
     def __init__(self, *modules: Any) -> None:  # torch calls it for a slice
@@ -40,10 +62,10 @@ class ChainedSequential(nn.Sequential):
 
     def forget(self) -> None:
         """Look for chains anew at the next call."""
-        vars(self).update(_seen=(), _steps=[], _adjustable=[], _kept=KeptInference())
+        vars(self).update(_split=None, _kept=KeptInference())
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_seen": (), "_steps": [], "_adjustable": []}
+        return {**self.__dict__, "_split": None}
 
     def forward(self, input: th.Tensor) -> th.Tensor:
         """Apply the modules in turn, as ``Sequential`` does."""
@@ -59,15 +81,11 @@ class ChainedSequential(nn.Sequential):
         if hooked or watched(input) or any_global_hook():
             y: th.Tensor = super().forward(input)  # type: ignore[no-untyped-call]
             return y
-        if called != self._seen or not all(map(tells_its_slope, self._adjustable)):
-            self._steps = _steps(modules)
-            fused = (
-                after for step, *_ in self._steps for after in getattr(step, "activations", ())
-            )
-            self._adjustable = [after for after in fused if isinstance(after, ADJUSTABLE)]
-            self._seen = called  # last, for other threads
+        split = self._split
+        if split is None or not split.fits(called):
+            split = self._split = Split.of(modules, called)
         x, batch, lead = input, 0, input.shape[:-1]
-        for step, tiled_in, tiled_out in self._steps:
+        for step, tiled_in, tiled_out in split.steps:
             if not isinstance(step, Chain):
                 x = step(x)
                 continue
@@ -135,5 +153,6 @@ def chain_up(root: nn.Module) -> None:
 
 def unchain(module: ChainedSequential) -> None:
     """Turn it into a plain ``Sequential`` again, in place."""
-    del module._seen, module._steps, module._adjustable, module._kept
+    for name in ("_split", "_kept"):
+        vars(module).pop(name, None)
     become(module, nn.Sequential)

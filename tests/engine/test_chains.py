@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import threading
 from functools import partial
 
 import numpy as np
@@ -15,6 +16,7 @@ from hypothesis import strategies as st
 from torch import nn
 from torch.nn import functional
 
+from sb3_sparse.engine.activations import tells_its_slope
 from sb3_sparse.engine.linear import SparseLinear
 from sb3_sparse.engine.native import library
 from sb3_sparse.engine.sequential import ChainedSequential, chain_up
@@ -360,7 +362,7 @@ def test_layers_that_become_sparse_later_join_the_chain():
         SparseLinear.convert(sequence[i], Structure.of_mask(mask, mask.shape), is_target=False)
         chain_up(sequence)
         close(sequence(x), dense(x))
-    assert len(sequence._steps) == 1
+    assert len(sequence._split.steps) == 1
 
 
 def test_no_nan_is_seen_where_there_is_none():
@@ -404,3 +406,37 @@ def test_a_batch_goes_through_while_another_thread_moves_connections():
     )
     assert len(found) > 10
     assert set(found) <= allowed
+
+
+def test_a_thread_may_call_while_another_finds_the_chains(monkeypatch):
+    _, sparse = networks([5, 8, 3], ["some"], nn.ReLU, True, 0)
+    expected, found, x = sparse(th.ones(7, 5)), [], th.ones(7, 5)
+    chain_up(sparse)  # it looks for chains anew
+
+    def meanwhile(module: nn.Module, name: str, value: object) -> None:
+        vars(module)[name] = value
+        thread = threading.Thread(target=lambda: found.append(sparse(x)))
+        thread.start()
+        thread.join()
+
+    monkeypatch.setattr(ChainedSequential, "__setattr__", meanwhile)
+    close(sparse(x), expected)
+    assert found
+    for y in found:
+        close(y, expected)
+
+
+def test_a_call_goes_on_while_another_thread_forgets_the_chains(monkeypatch):
+    _, sparse = networks([5, 8, 3], ["some"], nn.LeakyReLU, True, 0)
+    x = th.ones(7, 5)
+    expected, forgotten = sparse(x), []
+
+    def meanwhile(module: nn.Module) -> bool:
+        if not forgotten:
+            sparse.forget()
+            forgotten.append(module)
+        return tells_its_slope(module)
+
+    monkeypatch.setattr("sb3_sparse.engine.sequential.tells_its_slope", meanwhile)
+    close(sparse(x), expected)
+    assert forgotten

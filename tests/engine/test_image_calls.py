@@ -141,7 +141,7 @@ def test_a_traced_network_is_the_network(both, x):
 def test_a_tracers_sizes_are_not_taken_for_numbers():
     _, sparse = twins(convolution())
     sparse(th.zeros(1, 2, 3, 3))
-    ((chain, *_),) = sparse.requires_grad_(False)._steps
+    ((chain, *_),) = sparse.requires_grad_(False)._split.steps
     before = chain._call.cache_info()
     with th.no_grad():
         th.jit.trace(lambda x: chain(x), th.zeros(1, 2, 4, 4), check_trace=False)
@@ -259,7 +259,7 @@ def test_memory_is_used_again_once_a_graph_is_gone():
 def test_steps_of_training_share_their_memory(both, x):
     _, sparse = both
     sparse(x).sum().backward()
-    ((step, *_),) = sparse._steps
+    ((step, *_),) = sparse._split.steps
     ((block, _),) = step._memory._blocks
     for _ in range(3):
         sparse(x).sum().backward()
