@@ -160,7 +160,9 @@ def _size(shape: Shape, ring: int) -> int:
 
 
 def _shapes(steps: Sequence[ImageStep], shape: Shape) -> list[Shape] | None:
-    """Compute the shape of every map; None where sizes or channels do not fit."""
+    """Compute the shape of every map; None where sizes, channels or windows do not fit."""
+    if min(shape) < 1:
+        return None
     count = 1 + max(number for step in steps for number in (step.output, step.copy or 0))
     shapes: list[Shape] = [shape] * count
     for step in steps:
@@ -169,6 +171,8 @@ def _shapes(steps: Sequence[ImageStep], shape: Shape) -> list[Shape] | None:
             if channels != step.weight[1]:
                 return None
             channels = step.weight[0]
+        if min(*step.window.kernel, *step.window.stride) < 1 or min(step.window.padding) < 0:
+            return None
         height, width = step.window.result(height, width)
         result = (channels, height, width)
         if min(result) < 1 or (step.add is not None and shapes[step.add] != result):

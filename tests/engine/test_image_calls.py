@@ -369,13 +369,23 @@ def test_wrong_shapes_get_torchs_own_error(both, shape):
     assert messages[0] == messages[1]
 
 
-def test_images_that_are_too_small_get_torchs_own_error():
-    networks = twins(convolution(), nn.Conv2d(2, 2, 3), nn.Conv2d(2, 2, 3))
-    for small in (th.zeros(1, 2, 4, 9), th.zeros(1, 2, 0, 9)):
+@pytest.mark.parametrize(
+    ("modules", "size"),
+    [
+        (lambda: [convolution(), nn.Conv2d(2, 2, 3), nn.Conv2d(2, 2, 3)], (4, 9)),
+        (lambda: [convolution(), nn.Conv2d(2, 2, 3), nn.Conv2d(2, 2, 3)], (0, 9)),
+        (lambda: [nn.Conv2d(2, 2, 1, padding=1)], (0, 9)),
+        (lambda: [nn.Conv2d(2, 2, 1, padding=1)], (4, 0)),
+        (lambda: [nn.MaxPool2d(2, 1, 1), nn.Conv2d(2, 2, 1)], (4, 0)),
+    ],
+)
+def test_images_that_are_too_small_get_torchs_own_error(modules, size):
+    networks = twins(*modules())
+    for batch in (1, 17):
         messages = []
         for network in networks:
             with pytest.raises(RuntimeError) as raised:
-                network(small)
+                network(th.zeros(batch, 2, *size))
             messages.append(str(raised.value))
         assert messages[0] == messages[1]
 

@@ -6,6 +6,7 @@ from collections import defaultdict
 from collections.abc import Iterator
 from itertools import combinations
 
+import pytest
 import torch as th
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -173,7 +174,16 @@ def test_shapes_that_do_not_fit_have_no_layout():
     narrow = convolution(3, 2, Window((3, 3), (1, 1), (0, 0)), 1, 1, 2, add=0)
     assert lay_out([steps[0], narrow], (3, 4, 5), True) is None  # another size than what is added
     assert lay_out([narrow._replace(input=0, source=0, add=None)], (2, 2, 9), True) is None
+    assert lay_out(steps, (3, 0, 5), True) is None  # though a padding makes places of it
+    assert lay_out(steps, (3, 4, 0), True) is None
     assert lay_out(steps, (3, 60000, 60000), True) is None  # beyond 32 bits
+
+
+@pytest.mark.parametrize(
+    "window", [((0, 3), (1, 1), (1, 1)), ((3, 3), (1, 0), (1, 1)), ((3, 3), (1, 1), (-1, 1))]
+)
+def test_windows_that_torch_rejects_have_no_layout(window):
+    assert lay_out([convolution(2, 3, Window(*window), 0, 0, 1)], (3, 9, 9), True) is None
 
 
 def test_windows_are_read_from_modules():
