@@ -2,12 +2,31 @@
 
 from __future__ import annotations
 
+from math import prod
+from operator import attrgetter
+
 import torch as th
 from torch import nn
 
 from sb3_sparse.engine.image_layout import ImageStep, Window
 from sb3_sparse.engine.images import ImageChain
 from sb3_sparse.engine.layer import SparseLayer
+from sb3_sparse.errors import UnsupportedError
+
+convolution_attributes = attrgetter(
+    "in_channels", "out_channels", "kernel_size", "stride", "padding", "dilation", "groups",
+    "padding_mode",
+)  # fmt: skip
+"""What a convolution is set to, which the user may change."""
+
+
+def _is_plain(module: nn.Conv2d) -> bool:
+    return (
+        module.groups == 1
+        and module.dilation in (1, (1, 1))
+        and module.padding_mode == "zeros"
+        and not isinstance(module.padding, str)
+    )
 
 
 class SparseConv2d(SparseLayer, nn.Conv2d):
@@ -22,19 +41,30 @@ class SparseConv2d(SparseLayer, nn.Conv2d):
     @classmethod
     def takes(cls, module: nn.Module) -> bool:
         """Whether a module is a convolution without groups, dilation and padding but by zeros."""
-        return (
-            type(module) is nn.Conv2d
-            and module.groups == 1
-            and module.dilation == (1, 1)
-            and module.padding_mode == "zeros"
-            and not isinstance(module.padding, str)
-        )
+        return type(module) is nn.Conv2d and _is_plain(module)
 
     @property
     def dense_shape(self) -> tuple[int, ...]:
         return self.out_channels, self.in_channels, *self.kernel_size
 
+    @property
+    def is_computed(self) -> bool:
+        """Whether the kernels compute the layer as it is set now."""
+        rows, *columns = self.dense_shape
+        return _is_plain(self) and self.structure.shape == (rows, prod(columns))
+
     def forward(self, input: th.Tensor) -> th.Tensor:
-        """Apply the layer, as ``nn.Conv2d`` does."""
+        """Apply the layer, as ``nn.Conv2d`` does.
+
+        :raises UnsupportedError: if it has been set to what the kernels do not compute
+        """
+        if not self.is_computed:
+            raise UnsupportedError(
+                "a convolution in sparse storage has no groups and no dilation, is padded by zeros "
+                "and keeps the shape of its weight, got "
+                f"groups={self.groups}, dilation={self.dilation}, padding={self.padding!r}, "
+                f"padding_mode={self.padding_mode!r} and the shape {self.dense_shape}; "
+                "use compute='masked' for anything else"
+            )
         step = ImageStep(Window.of(self), self.dense_shape, None, 0, 0, 1)
         return ImageChain([step], [self])(input)

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from copy import deepcopy
 from math import prod
-from typing import NamedTuple
+from operator import attrgetter
+from typing import Any, NamedTuple
 
 from torch import nn
 
 from sb3_sparse.engine.activations import tells_its_slope
-from sb3_sparse.engine.convolution import SparseConv2d
+from sb3_sparse.engine.convolution import SparseConv2d, convolution_attributes
 from sb3_sparse.engine.image_layout import ImageStep, Window
 from sb3_sparse.engine.paths import is_residual, is_sequence
 
@@ -20,6 +22,34 @@ class _Enter(NamedTuple):
 
 class _Leave(NamedTuple):
     """Marks its end."""
+
+
+_ATTRIBUTES: dict[type[nn.Module], Callable[[Any], Any]] = {
+    SparseConv2d: convolution_attributes,
+    nn.MaxPool2d: attrgetter(
+        "kernel_size", "stride", "padding", "dilation", "ceil_mode", "return_indices"
+    ),
+    nn.ReLU: attrgetter("inplace"),
+}
+"""Attributes that the steps depend on."""
+
+
+class ImageAttributes:
+    """Attributes of modules on images as they are now.
+
+    :param modules: the modules, also such that have none
+    """
+
+    def __init__(self, modules: Iterable[nn.Module]) -> None:
+        self._read = [(_ATTRIBUTES[type(m)], m) for m in modules if type(m) in _ATTRIBUTES]
+        self._found = deepcopy(self._now())
+
+    def unchanged(self) -> bool:
+        """Whether nothing has changed since creation."""
+        return self._now() == self._found
+
+    def _now(self) -> list[Any]:
+        return [read(module) for read, module in self._read]
 
 
 Token = nn.Module | _Enter | _Leave
@@ -85,7 +115,11 @@ def _tokens(modules: Iterable[nn.Module]) -> list[Token] | None:
             if inner is None:
                 return None
             found += [_Enter(), *inner, _Leave()] if is_residual(module) else inner
-        elif type(module) is SparseConv2d or _is_pool(module) or tells_its_slope(module):
+        elif type(module) is SparseConv2d:
+            if not module.is_computed:
+                return None
+            found.append(module)
+        elif _is_pool(module) or tells_its_slope(module):
             found.append(module)
         elif type(module) is not nn.Identity:
             return None

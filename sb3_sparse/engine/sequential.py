@@ -10,7 +10,7 @@ from torch import nn
 
 from sb3_sparse.engine.activations import ACTIVATIONS, ADJUSTABLE, tells_its_slope
 from sb3_sparse.engine.chains import Chain, watched
-from sb3_sparse.engine.image_steps import has_convolution, plan
+from sb3_sparse.engine.image_steps import ImageAttributes, has_convolution, plan
 from sb3_sparse.engine.images import ImageChain
 from sb3_sparse.engine.inference import by_modules
 from sb3_sparse.engine.internals import MODULE_HOOKS, any_global_hook, become
@@ -28,22 +28,30 @@ class Split(NamedTuple):
     :param called: the modules that it was made for
     :param steps: chains and other modules, and whether a chain's input and output are tiles
     :param adjustable: activations within the chains whose parameters the user may change
+    :param attributes: of the modules on images
     """
 
     called: tuple[nn.Module, ...]
     steps: list[tuple[Any, bool, bool]]
-    adjustable: list[nn.Module]
+    adjustable: Sequence[nn.Module]
+    attributes: ImageAttributes
 
     @classmethod
     def of(cls, modules: Sequence[nn.Module], called: tuple[nn.Module, ...]) -> Split:
         """Split modules that are called in turn, and may call others."""
+        attributes = ImageAttributes(called if any(map(has_convolution, modules)) else ())
         steps = _steps(modules)
         fused = (after for step, *_ in steps for after in getattr(step, "activations", ()))
-        return cls(called, steps, [after for after in fused if isinstance(after, ADJUSTABLE)])
+        adjustable = [after for after in fused if isinstance(after, ADJUSTABLE)]
+        return cls(called, steps, adjustable, attributes)
 
     def fits(self, called: tuple[nn.Module, ...]) -> bool:
         """Whether the modules and their settings are those that it was made for."""
-        return called == self.called and all(map(tells_its_slope, self.adjustable))
+        return (
+            called == self.called
+            and self.attributes.unchanged()
+            and all(map(tells_its_slope, self.adjustable))
+        )
 
 
 class ChainedSequential(nn.Sequential):

@@ -14,11 +14,22 @@ import numpy as np
 import pytest
 import torch as th
 import torch.fx.experimental.proxy_tensor
-from image_support import active, chains, close, convolution, convolutions, impala, twins, whole
+from image_support import (
+    active,
+    chains,
+    close,
+    compare,
+    convolution,
+    convolutions,
+    impala,
+    twins,
+    whole,
+)
 from torch import nn
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from sb3_sparse.engine.convolution import SparseConv2d
+from sb3_sparse.engine.residual import Residual
 from sb3_sparse.engine.reused import ReusedMemory
 from sb3_sparse.engine.sequential import chain_up
 from sb3_sparse.engine.structure import Structure
@@ -128,6 +139,73 @@ def test_a_changed_network_is_noticed(both, x):
     for network in both:
         network[2] = nn.Identity()
     close(sparse(x), dense(x))
+
+
+@pytest.mark.parametrize(
+    ("find", "name", "value"),
+    [
+        (lambda network: network[0], "stride", (2, 1)),
+        (lambda network: network[0], "padding", (2, 0)),
+        (lambda network: network[4], "stride", 1),
+        (lambda network: network[1], "kernel_size", 2),
+        (lambda network: network[1], "stride", (1, 2)),
+        (lambda network: network[1], "padding", 0),
+        (lambda network: network[1], "ceil_mode", True),
+        (lambda network: network[1], "dilation", 2),
+        (lambda network: inner(network)[0], "inplace", True),
+    ],
+)
+def test_a_changed_attribute_is_noticed(both, x, find, name, value):
+    x = x[..., :6, :8]
+    compare(*both, x)
+    before = both[1](x)
+    for network in both:
+        setattr(find(network), name, value)
+    compare(*both, x)
+    now = both[1](x)
+    assert now.shape != before.shape or not th.allclose(now, before)
+
+
+def test_an_attribute_that_changes_in_place_is_noticed(x):
+    dense, sparse = twins(convolution(), nn.MaxPool2d([2, 3]))
+    for _ in range(2):
+        compare(dense, sparse, x)
+        dense[1].kernel_size[0] = sparse[1].kernel_size[0] = 1
+
+
+def test_a_pooling_may_give_its_places_later(x):
+    dense, sparse = twins(convolution(), nn.MaxPool2d(2))
+    close(sparse(x), dense(x))
+    dense[1].return_indices = sparse[1].return_indices = True
+    close(sparse(x)[0], dense(x)[0])
+    np.testing.assert_array_equal(sparse(x)[1], dense(x)[1])
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("padding_mode", "reflect"),
+        ("padding", "same"),
+        ("groups", 2),
+        ("dilation", (2, 2)),
+        ("kernel_size", (2, 3)),
+    ],
+)
+@pytest.mark.parametrize("called", [False, True])
+def test_a_convolution_that_becomes_another_kind_is_rejected(x, name, value, called):
+    _, sparse = twins(convolution(), nn.ReLU(), Residual(convolution()))
+    if called:
+        sparse(x)
+    for layer in convolutions(sparse):
+        before = getattr(layer, name)
+        setattr(layer, name, value)
+        for call in (lambda: sparse(x), lambda layer=layer: layer(x)):
+            with pytest.raises(
+                UnsupportedError, match="has no groups and no dilation.* got .*'masked'"
+            ):
+                call()
+        setattr(layer, name, before)
+    sparse(x)
 
 
 def test_a_traced_network_is_the_network(both, x):
@@ -483,7 +561,7 @@ def test_layers_that_become_sparse_later_join_the_chain(x):
 def test_a_part_of_a_network_computes_that_part(both, x):
     dense, sparse = both
     close(sparse[:2](x), dense[:2](x))
-    assert chains(sparse[:2]) == []  # it has its own
+    assert sparse[:2]._split is None  # it has its own
     close(sparse[2:](sparse[:2](x)), sparse(x))
     with th.no_grad():
         close(sparse[:2](x[:1]), dense[:2](x[:1]))
