@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from math import prod
 from operator import attrgetter
+from typing import Any
 
 import torch as th
 from torch import nn
@@ -37,6 +39,8 @@ class SparseConv2d(SparseLayer, nn.Conv2d):
 
     dense_class = nn.Conv2d
     weight: nn.Parameter
+    _alone: tuple[Any, ImageChain] | None = None
+    """Its attributes, and the chain that computes it where it is called by itself."""
 
     @classmethod
     def takes(cls, module: nn.Module) -> bool:
@@ -58,6 +62,20 @@ class SparseConv2d(SparseLayer, nn.Conv2d):
 
         :raises UnsupportedError: if it has been set to what the kernels do not compute
         """
+        attributes, alone = convolution_attributes(self), self._alone
+        if alone is None or alone[0] != attributes:
+            alone = self._alone = deepcopy(attributes), self._chain()
+        return alone[1](input)
+
+    def to_dense(self) -> None:
+        vars(self).pop("_alone", None)
+        super().to_dense()
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**super().__getstate__(), "_alone": None}
+
+    def _chain(self) -> ImageChain:
+        """Make a chain of this layer alone."""
         if not self.is_computed:
             raise UnsupportedError(
                 "a convolution in sparse storage has no groups and no dilation, is padded by zeros "
@@ -67,4 +85,4 @@ class SparseConv2d(SparseLayer, nn.Conv2d):
                 "use compute='masked' for anything else"
             )
         step = ImageStep(Window.of(self), self.dense_shape, None, 0, 0, 1)
-        return ImageChain([step], [self])(input)
+        return ImageChain([step], [self])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import gc
+import pickle
 import weakref
 from types import SimpleNamespace
 
@@ -16,6 +17,7 @@ from hypothesis import strategies as st
 from torch import nn
 
 from sb3_sparse.engine.convolution import SparseConv2d
+from sb3_sparse.engine.images import ImageChain
 from sb3_sparse.engine.layer import dense_weight
 from sb3_sparse.engine.masked import MaskedStorage
 from sb3_sparse.engine.sparse import SparseStorage
@@ -142,6 +144,38 @@ def test_a_result_does_not_keep_the_layer():
     gc.collect()
     assert found() is None
     y.sum().backward()
+
+
+def test_a_layer_alone_keeps_its_chain(monkeypatch):
+    made = []
+    monkeypatch.setattr(
+        "sb3_sparse.engine.convolution.ImageChain",
+        lambda *args: made.append(args) or ImageChain(*args),
+    )
+    both = twins()
+    x = th.randn(2, 3, 5, 5)
+    for _ in range(3):
+        close(both.sparse(x), both.dense(x))
+    assert len(made) == 1
+    both.sparse.stride = both.dense.stride = (2, 1)
+    close(both.sparse(x), both.dense(x))
+    assert len(made) == 2
+
+
+@pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda net: pickle.loads(pickle.dumps(net))])
+def test_a_copy_and_a_dense_layer_have_no_chain_of_another(duplicate):
+    both = twins()
+    x = th.randn(2, 3, 5, 5)
+    both.sparse(x)
+    other = duplicate(both.sparse)
+    with th.no_grad():
+        other.weight.zero_()
+        other.bias.zero_()
+    assert not other(x).any()
+    close(both.sparse(x), both.dense(x))
+    both.sparse.to_dense()
+    assert type(both.sparse) is nn.Conv2d
+    assert vars(both.sparse).keys() == vars(both.dense).keys()
 
 
 def test_a_batch_goes_through_while_another_thread_moves_connections():
