@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cache, partial
+from functools import lru_cache, partial
 from typing import Any
 from weakref import ref
 
@@ -16,6 +16,9 @@ from sb3_sparse.engine.products import Products
 from sb3_sparse.engine.reused import ReusedMemory
 from sb3_sparse.engine.structure import Structure
 from sb3_sparse.errors import UnsupportedError
+
+SIZES = 16
+"""Of images, for which a chain stays prepared."""
 
 
 def pays(batch: int, structures: Sequence[Structure]) -> bool:
@@ -42,7 +45,7 @@ class ImageChain:
         self._layers = list(layers)
         # As for chains of linear layers: a graph must not hold the layers.
         self._references = [ref(layer) for layer in self._layers]
-        self._call = cache(partial(prepare, self.steps))
+        self._call = lru_cache(SIZES)(partial(prepare, self.steps))
         self._memory = ReusedMemory()
 
     def __call__(self, x: th.Tensor) -> th.Tensor:
@@ -71,12 +74,13 @@ class ImageChain:
         trains = th.is_grad_enabled() and (
             x.requires_grad or any(p is not None and p.requires_grad for p in parameters)
         )
-        fits = not seen and x.dim() == 4  # a tracer's sizes are no numbers
-        call = self._call(tuple(x.shape[1:]), trains) if fits else None
-        if call is None:  # where sizes do not fit, torch says so
+        if seen:  # a tracer's sizes are no numbers
             return by_dense_weights(self.steps, structures, x, parameters)
-        if not (pays(len(x), structures) or (len(x) <= FEW and not trains)):
-            return by_dense_weights(self.steps, structures, x, parameters, self._references)
+        call = self._call(tuple(x.shape[1:]), trains) if x.dim() == 4 else None
+        # Where sizes do not fit, torch says so.
+        if call is None or not (pays(len(x), structures) or (len(x) <= FEW and not trains)):
+            with th.autocast("cpu", enabled=False):  # float32, as by the kernels
+                return by_dense_weights(self.steps, structures, x, parameters, self._references)
         how = ImagePass(self.steps, call, structures, self._references, len(x), self._memory)
         x = x.contiguous().resolve_neg()
         if trains:

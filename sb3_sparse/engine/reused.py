@@ -10,6 +10,8 @@ from sb3_sparse.engine.internals import use_count
 class ReusedMemory:
     """Hands out float32 memory on the CPU, the same one once all who had it have let go of it.
 
+    Memory more than twice as large as needed is given back.
+
     Fresh pages of a large block cost as much as the arithmetic on it, and torch returns large
     blocks to the system each time.
     """
@@ -24,12 +26,12 @@ class ReusedMemory:
         :return: shape ``(size,)``
         """
         if not size:
-            return self._block(0)[0]  # the block stays for those who need one
+            return self._block(0)[0]  # a call that needs none leaves the block alone
         try:
             block, count = self._blocks.pop()  # no other thread sees it meanwhile
         except IndexError:
             block, count = self._block(size)
-        if block.numel() < size or use_count(block) > count:
+        if not size <= block.numel() <= 2 * size or use_count(block) > count:
             block, count = self._block(size)
         memory = block[:size]
         self._blocks[:] = [(block, count)]

@@ -29,6 +29,7 @@ from torch import nn
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from sb3_sparse.engine.convolution import SparseConv2d
+from sb3_sparse.engine.images import pays
 from sb3_sparse.engine.residual import Residual
 from sb3_sparse.engine.reused import ReusedMemory
 from sb3_sparse.engine.sequential import chain_up
@@ -326,12 +327,28 @@ def test_memory_is_used_again_once_a_graph_is_gone():
     assert part.data_ptr() == again + 4 * 50
     assert place(100) != again
     again = place(100)
-    assert place(7) == again
+    assert place(50) == again
     kept = memory(100)
     assert memory(0).numel() == 0  # it does not replace the block
     del kept
     assert place(100) == again
     assert place(101) != again
+
+
+def test_memory_is_given_back_that_is_twice_too_large():
+    memory = ReusedMemory()
+    for size, kept in ((100, 100), (50, 100), (49, 49), (10**6, 10**6), (7, 7)):
+        assert memory(size).numel() == size
+        ((block, _),) = memory._blocks
+        assert block.numel() == kept
+
+
+def test_only_so_many_sizes_of_images_stay_prepared(both):
+    _, sparse = both
+    for height in range(5, 26):
+        sparse(th.zeros(1, 2, height, 5))
+    ((chain, *_),) = sparse._split.steps
+    assert chain._call.cache_info().currsize == 16
 
 
 def test_steps_of_training_share_their_memory(both, x):
@@ -508,13 +525,18 @@ def test_what_follows_may_work_in_place(both, x):
     close(found[1], found[0])
 
 
-def test_under_autocast_sparse_layers_stay_float32(both, x):
+@pytest.mark.parametrize("batch", [2, 8, 17])
+@pytest.mark.parametrize("graph", [False, True])
+def test_under_autocast_sparse_layers_stay_float32(both, x, monkeypatch, batch, graph):
+    monkeypatch.setattr("sb3_sparse.engine.images.pays", pays)
     dense, sparse = both
     mixed = nn.Sequential(nn.Conv2d(2, 2, 1), sparse)
-    with th.autocast("cpu", dtype=th.bfloat16):
-        y = mixed(x)
-    assert y.dtype == th.float32
+    x = x[:batch]
+    with th.autocast("cpu", dtype=th.bfloat16), th.set_grad_enabled(graph):
+        y, part = mixed(x), sparse(x)
+    assert y.dtype == part.dtype == th.float32
     np.testing.assert_allclose(y.detach(), dense(mixed[0](x)).detach(), atol=0.05)
+    close(part, dense(x))
 
 
 def test_torchs_defaults_change_nothing(both, x):

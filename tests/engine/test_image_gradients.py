@@ -140,6 +140,16 @@ def test_of_functional_gradients_the_first_without_a_graph_counts(ways):
     both.equal(both.taken(), list(expected))
 
 
+def test_images_that_are_too_large_for_the_kernels_give_dense_gradients(monkeypatch):
+    monkeypatch.setattr("sb3_sparse.engine.image_layout.LIMIT", 100)
+    monkeypatch.setattr(ImagePass, "forward", None)  # which is not called
+    both = Watched(*impala())
+    x = th.randn(17, 2, 7, 9)
+    for network in (both.sparse, both.dense):
+        network(x).square().sum().backward()
+    both.equal(both.taken(), [weight.grad for weight in both.weights])
+
+
 def test_what_nobody_wants_is_not_computed(monkeypatch):
     computed = []
     outer = ImagePass._outer
