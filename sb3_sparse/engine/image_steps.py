@@ -13,7 +13,7 @@ from torch import nn
 from sb3_sparse.engine.activations import tells_its_slope
 from sb3_sparse.engine.convolution import SparseConv2d, convolution_attributes
 from sb3_sparse.engine.image_layout import ImageStep, Window
-from sb3_sparse.engine.paths import is_residual, is_sequence
+from sb3_sparse.engine.paths import called_by, is_residual, is_sequence
 
 
 class _Enter(NamedTuple):
@@ -58,7 +58,7 @@ Token = nn.Module | _Enter | _Leave
 def has_convolution(module: nn.Module) -> bool:
     """Whether a module is a sparse convolution, or a residual block or ``Sequential`` with one."""
     if is_residual(module) or is_sequence(module):
-        return any(map(has_convolution, module.children()))
+        return any(map(has_convolution, called_by(module)))
     return type(module) is SparseConv2d
 
 
@@ -99,7 +99,7 @@ def is_between(module: nn.Module) -> bool:
 
 def in_order(module: nn.Module) -> Iterator[nn.Module]:
     """Go through what a ``Sequential`` or a residual block calls, in that order."""
-    for child in module.children():
+    for child in called_by(module):
         if is_sequence(child) or is_residual(child):
             yield from in_order(child)
         else:
@@ -111,7 +111,7 @@ def _tokens(modules: Iterable[nn.Module]) -> list[Token] | None:
     found: list[Token] = []
     for module in modules:
         if is_sequence(module) or is_residual(module):
-            inner = _tokens(module.children())
+            inner = _tokens(called_by(module))
             if inner is None:
                 return None
             found += [_Enter(), *inner, _Leave()] if is_residual(module) else inner

@@ -47,6 +47,11 @@ def is_residual(module: nn.Module) -> bool:
     )
 
 
+def called_by(module: nn.Module) -> list[nn.Module]:
+    """Return what a sequence or a residual block calls, in that order, also twice."""
+    return [child for child in module._modules.values() if child is not None]
+
+
 def parts_of(path: Iterable[nn.Module]) -> list[Part] | None:
     """Split a path into layers and what surrounds them; None if it has any other module."""
     parts: list[Part] = []
@@ -61,7 +66,7 @@ def _split(path: Iterable[nn.Module], parts: list[Part]) -> bool:
         last = parts[-1] if parts else None
         behind_norm = last is not None and last.layer is None
         if is_sequence(module):
-            if not _split(module.children(), parts):
+            if not _split(called_by(module), parts):
                 return False
         elif is_residual(module):
             if behind_norm or not _split_residual(module, parts):
@@ -86,7 +91,7 @@ def _split(path: Iterable[nn.Module], parts: list[Part]) -> bool:
 def _split_residual(module: nn.Module, parts: list[Part]) -> bool:
     before = len(parts)
     inner: list[Part] = []  # of its own, so that no activation belongs to a layer before the block
-    if not _split(module.children(), inner):
+    if not _split(called_by(module), inner):
         return False
     if not inner or inner[-1].layer is None or inner[-1].shortcut is not None:
         return False

@@ -134,6 +134,13 @@ def test_a_layer_may_be_called_twice():
     assert chains(sparse) == [4]
 
 
+def test_an_activation_within_a_sequence_may_be_called_twice():
+    tanh = nn.Tanh()
+    dense, sparse = twins(nn.Sequential(convolution(), tanh, convolution(), tanh), convolution())
+    compare(dense, sparse, th.randn(17, 2, 5, 4))
+    assert chains(sparse) == [3]
+
+
 def test_a_slope_may_change_between_two_calls():
     after = nn.LeakyReLU(0.5)
     dense, sparse = twins(convolution(), after, convolution())

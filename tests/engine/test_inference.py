@@ -168,6 +168,14 @@ def test_inputs_that_it_does_not_take_and_results_without_end_are_left_to_the_mo
     assert Inference.of([[network([5, 4, 3], ["masked"], nn.ReLU)]])(x) is None
 
 
+def test_a_module_counts_as_often_as_it_is_called():
+    twice, tanh = nn.Linear(6, 6), nn.Tanh()
+    net = nn.Sequential(twice, tanh, nn.Sequential(nn.Linear(6, 6), tanh, twice), tanh)
+    x = th.randn(3, 6)
+    (ours,) = Inference.of([[net]])(x)
+    close(ours, net(x).detach())
+
+
 def test_whoever_watches_gets_the_modules():
     net = network([5, 4, 3], ["sparse", "masked"], nn.Tanh)
     found = Inference.of([[net]])
