@@ -6,13 +6,14 @@ maps. A layout gives every map, and its gradient, a place in memory for images o
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from math import prod
 from typing import Any, NamedTuple
 
 from torch import nn
 
 LANES = 16
-"""Images to a tile."""
+"""Images to a tile; ``kernels.h`` has the same number."""
 LIMIT = 2**31 - 1
 """The kernels find numbers within a map by 32-bit offsets."""
 Shape = tuple[int, int, int]
@@ -131,7 +132,7 @@ def lay_out(steps: Sequence[ImageStep], shape: Shape, keep: bool) -> Layout | No
     ring, grad_ring = _rings(steps, shapes)
     sizes = [_size(shape, ring) for shape in shapes]
     grad_sizes = [_size(shape, grad_ring) for shape in shapes]
-    if max(*sizes, *grad_sizes) > LIMIT:
+    if max(*sizes, *grad_sizes, *_dealt_sizes(steps, shapes)) > LIMIT:
         return None
     at, kept_size = [0] * len(shapes), 0
     for number in sorted(kept) if keep else ():
@@ -157,6 +158,16 @@ def lay_out(steps: Sequence[ImageStep], shape: Shape, keep: bool) -> Layout | No
 
 def _size(shape: Shape, ring: int) -> int:
     return shape[0] * (shape[1] + 2 * ring) * (shape[2] + 2 * ring) * LANES
+
+
+def _dealt_sizes(steps: Sequence[ImageStep], shapes: Sequence[Shape]) -> Iterator[int]:
+    """Bound the numbers of an image that ``one_image.c`` deals out by the strides of each step."""
+    for step in steps:
+        channels, *sizes = shapes[step.input]
+        _, strides, paddings = step.window
+        yield channels * prod(
+            size + 2 * p + s for size, s, p in zip(sizes, strides, paddings, strict=True)
+        )
 
 
 def _shapes(steps: Sequence[ImageStep], shape: Shape) -> list[Shape] | None:

@@ -177,6 +177,9 @@ def test_shapes_that_do_not_fit_have_no_layout():
     assert lay_out(steps, (3, 0, 5), True) is None  # though a padding makes places of it
     assert lay_out(steps, (3, 4, 0), True) is None
     assert lay_out(steps, (3, 60000, 60000), True) is None  # beyond 32 bits
+    # Dealt out by such a stride, 9 x 9 numbers take 60000 x 60000 places.
+    far = Window((3, 3), (60000, 60000), (0, 0))
+    assert lay_out([convolution(2, 3, far, 0, 0, 1)], (3, 9, 9), True) is None
 
 
 @pytest.mark.parametrize(

@@ -68,12 +68,12 @@ INLINE void block_of(int places, int64_t in_step, int64_t outputs, taps_t taps, 
 
 static void run_block(int64_t places, int64_t outputs, taps_t taps, const float *bias,
                       const block_t *block) {
-#define CASE(N)                                                                    \
-    case N:                                                                        \
-        if (block->in_step == LANES)                                               \
-            block_of(N, LANES, outputs, taps, bias, block);                        \
-        else                                                                       \
-            block_of(N, block->in_step, outputs, taps, bias, block);               \
+#define CASE(N)                                                      \
+    case N:                                                          \
+        if (block->in_step == LANES)                                 \
+            block_of(N, LANES, outputs, taps, bias, block);          \
+        else                                                         \
+            block_of(N, block->in_step, outputs, taps, bias, block); \
         break;
     switch (places) {
         CASE(1) CASE(2) CASE(3)
@@ -124,7 +124,7 @@ INLINE void dots_of(int count, int64_t rows, int64_t places, const float *g, int
 
 /* grad[k] (+)= sum over places of g[output of k] * x at the connection's offset. */
 static inline void dots(const image_step_t *step, const map_t *out, taps_t taps, plane_t x, plane_t g,
-                 float *grad, int add) {
+                        float *grad, int add) {
     int64_t most = DOTS_PLACES / out->width > 1 ? DOTS_PLACES / out->width : 1;
     int64_t x_row = step->stride_y * x.row, x_step = step->stride_x * LANES;
     for (int64_t i = 0; i < out->height; i += most, add = 1) {
@@ -139,7 +139,7 @@ static inline void dots(const image_step_t *step, const map_t *out, taps_t taps,
                     CASE(1) CASE(2) CASE(3) CASE(4) CASE(5) CASE(6) CASE(7)
                 default:
                     count = 8;
-                    switch (count) { CASE(8) }
+                    dots_of(8, rows, out->width, d, g.row, from, x_row, x_step, taps.offset + k, grad + k, add);
                 }
 #undef CASE
             }

@@ -30,9 +30,9 @@ typedef struct {
     int (*images_backward)(const images_t *, const map_t *, const image_step_t *);
 } kernels_t;
 
-#define ENTRY(name, suffix)                                                                  \
-    {name, NAMED(forward, suffix), NAMED(backward, suffix), NAMED(act, suffix),    \
-     NAMED(fused, suffix), NAMED(images_forward, suffix), \
+#define ENTRY(name, suffix)                                                     \
+    {name, NAMED(forward, suffix), NAMED(backward, suffix), NAMED(act, suffix), \
+     NAMED(fused, suffix), NAMED(images_forward, suffix),                       \
      NAMED(images_one_by_one, suffix), NAMED(images_backward, suffix)}
 
 /* The best first. What is plain on aarch64 is NEON, which every such processor has. */

@@ -302,10 +302,6 @@ static void run_share(void *argument) {
     }
 }
 
-static void add_to(float *to, const float *from, int64_t count) {
-    for (int64_t i = 0; i < count; i++) to[i] += from[i];
-}
-
 static void run_phase(const program_t *program, const operation_t *first, const operation_t *last) {
     int64_t tiles = (program->batch + TILE - 1) / TILE;
     phase_t phase = {program, first, last, tiles, 1};

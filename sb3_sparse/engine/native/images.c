@@ -6,7 +6,6 @@
 
 #include <stdlib.h>
 
-
 /* One thread's share of a batch: the tiles [first, last). */
 typedef struct {
     const images_t *images;
@@ -274,10 +273,10 @@ static int run(void (*work)(void *), const images_t *images, const map_t *maps, 
     run_shares(work, shares, sizeof *shares, count);
     for (int64_t i = 1; i < count && back; i++)
         for (int64_t l = 0; l < n; l++) {
-            for (int64_t k = 0; steps[l].value_grad && k < nnz_of(steps + l, maps); k++)
-                steps[l].value_grad[k] += shares[i].value_grads[l][k];
-            for (int64_t r = 0; steps[l].bias_grad && r < maps[steps[l].out].channels; r++)
-                steps[l].bias_grad[r] += shares[i].bias_grads[l][r];
+            const image_step_t *step = steps + l;
+            int64_t nnz = nnz_of(step, maps), channels = maps[step->out].channels;
+            if (step->value_grad) add_to(step->value_grad, shares[i].value_grads[l], nnz);
+            if (step->bias_grad) add_to(step->bias_grad, shares[i].bias_grads[l], channels);
         }
     free(taps);
     free(lists);

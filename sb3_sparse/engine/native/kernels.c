@@ -172,11 +172,8 @@ int NAMED(backward, SUFFIX)(const layer_t *layers, const batch_t *batch) {
         for (int64_t l = 0; l < n; l++) {
             const layer_t *layer = layers + l;
             int64_t nnz = layer->row_start[layer->rows];
-            if (layer->value_grad)
-                for (int64_t k = 0; k < nnz; k++) layer->value_grad[k] += shares[i].value_grads[l][k];
-            if (layer->bias_grad)
-                for (int64_t r = 0; r < layer->rows; r++)
-                    layer->bias_grad[r] += shares[i].bias_grads[l][r];
+            if (layer->value_grad) add_to(layer->value_grad, shares[i].value_grads[l], nnz);
+            if (layer->bias_grad) add_to(layer->bias_grad, shares[i].bias_grads[l], layer->rows);
         }
     free(lists);
     return 0;

@@ -14,7 +14,7 @@
 #include <stdint.h>
 
 #define TILE 64
-#define LANES 16      /* of a small batch, which has tiles of its own */
+#define LANES 16      /* of a small batch, and of images; image_layout.py has the same number */
 #define MOST_STEPS 64 /* of networks that act */
 
 /* One layer, y = f(W x + b). All fields are 8 bytes wide; Python fills them in this order. */

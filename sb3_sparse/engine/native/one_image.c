@@ -193,7 +193,7 @@ int NAMED(images_one_by_one, SUFFIX)(const images_t *images, const map_t *maps, 
         }
         if (size > result) result = size;
     }
-    /* A vector may run on behind the end of what it reads. */
+    /* A block of places runs on behind the end of what it reads by up to LANES - 1 numbers. */
     int64_t each = (scratch + LANES + dealt + LANES + result + LANES) / LANES * LANES;
     float *memory = sb3_sparse_scratch(((count * each + connections) * sizeof(float) + 63) / 64 * 64);
     if (!memory) {
@@ -204,9 +204,12 @@ int NAMED(images_one_by_one, SUFFIX)(const images_t *images, const map_t *maps, 
     for (int64_t l = 0; l < n; l++)
         if (steps[l].kind == CONVOLUTION) offsets = set_taps(maps, steps + l, views + l, offsets);
     for (int64_t i = 0; i < count; i++, memory += each)
-        shares[i] = (share_t){images, maps, steps, views, images->batch * i / count,
-                              images->batch * (i + 1) / count, memory, memory + scratch + LANES,
-                              memory + scratch + LANES + dealt + LANES};
+        shares[i] = (share_t){.images = images, .maps = maps, .steps = steps, .views = views,
+                              .first = images->batch * i / count,
+                              .last = images->batch * (i + 1) / count,
+                              .scratch = memory,
+                              .dealt = memory + scratch + LANES,
+                              .result = memory + scratch + LANES + dealt + LANES};
     run_shares(work, shares, sizeof *shares, count);
     free(views);
     return 0;

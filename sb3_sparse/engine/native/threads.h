@@ -34,4 +34,9 @@ static inline int64_t shares_of(int64_t tiles, int64_t threads) {
     return count < 1 ? 1 : count;
 }
 
+/* Adds what another thread has summed up. */
+static inline void add_to(float *to, const float *from, int64_t count) {
+    for (int64_t i = 0; i < count; i++) to[i] += from[i];
+}
+
 #endif
