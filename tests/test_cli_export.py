@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch as th
 from sb3_contrib import RecurrentPPO
 from stable_baselines3.common.save_util import load_from_zip_file, save_to_zip_file
 from support import make
@@ -57,6 +58,26 @@ def test_a_run_is_exported_with_its_normalisation(run_folder, to, monkeypatch, c
         expected, _ = model.predict(normalization.normalize_obs(raw), deterministic=True)
         np.testing.assert_allclose(policy(raw), expected, atol=1e-5)
         assert not np.allclose(policy(raw), model.predict(raw, deterministic=True)[0], atol=1e-3)
+
+
+def test_a_run_is_exported_with_its_value_and_distribution(
+    run_folder, monkeypatch, capsys, tmp_path
+):
+    arguments = ["export", run_folder, "--to", "numpy", tmp_path / "p"]
+    code, said = command(monkeypatch, capsys, *arguments, "--with-value", "--stochastic")
+    assert code == 0, said
+    assert "1000 recorded and 1000 random observations; largest difference of value" in said
+    saved = SavedModel.find(run_folder)
+    model, policy = saved.load(), Policy(tmp_path / "p.npz")
+    normalization = pickle.loads(saved.vecnormalize.read_bytes())
+    raw = np.random.default_rng(0).normal(size=(9, 3)).astype(np.float32)
+    seen = th.as_tensor(normalization.normalize_obs(raw))
+    found = policy(raw)
+    assert found._fields == ("action", "value", "mean", "std")
+    expected = model.policy.predict_values(seen).detach()[:, 0]
+    np.testing.assert_allclose(found.value, expected, atol=1e-5)
+    std = model.policy.log_std.exp().detach().expand(9, 1)
+    np.testing.assert_allclose(found.std, std, atol=1e-6)
 
 
 def test_a_zip_in_a_run_folder_knows_its_run(run_folder, monkeypatch, capsys, tmp_path):
@@ -158,6 +179,8 @@ def test_int8_with_and_without_a_value(monkeypatch, capsys, tmp_path):
         (["model.zip", "--to", "onnx", "--int8"], "int8 is for to='c' only"),
         (["model.zip", "--int8=most"], "unknown value of int8 'most'; allowed are weights, full"),
         (["model.zip", "--int8", "full"], "recorded observations; give observations"),
+        (["model.zip", "--to", "dense", "--with-value"], "with_value is for c, numpy and onnx"),
+        (["model.zip", "--stochastic"], "SparseDQNPolicy has no distribution of actions"),
         (["model.zip", "--vecnormalize", "no.pkl"], "there is no file no.pkl; give what"),
         (["model.zip", "--algo", "sac"], "model.zip is a model of dqn, not of sac; leave --algo"),
         (["model.zip", "--algo", "dreamer"], "unknown algorithm 'dreamer'; allowed are dqn"),

@@ -10,7 +10,7 @@ from typer.core import TyperCommand
 
 from sb3_sparse.cli.common import Best, GymPackages, ModelAlgo, ModelEnv, Statistics, option, say
 from sb3_sparse.errors import ConfigError
-from sb3_sparse.export.formats import INT8, check_format, check_int8
+from sb3_sparse.export.formats import INT8, check_format, check_int8, check_outputs
 
 RECORDED = 1000
 
@@ -50,6 +50,14 @@ def export_command(
             show_default=False,
         ),
     ] = None,
+    with_value: Annotated[
+        bool,
+        option("Not for dense: also give the critic's estimate, V(s) or Q(s, a).", "--with-value"),
+    ] = False,
+    stochastic: Annotated[
+        bool,
+        option("Not for dense: also give mean and standard deviation, or logits.", "--stochastic"),
+    ] = False,
     best: Best = False,
     env: ModelEnv = None,
     gym_packages: GymPackages = None,
@@ -64,6 +72,7 @@ def export_command(
     """
     check_format(to)
     check_int8(int8, to)
+    check_outputs(to, with_value, stochastic, int8)
     from sb3_sparse.export import export_policy, record_observations
     from sb3_sparse.export.write import main_file
     from sb3_sparse.zoo.saved import SavedModel
@@ -92,6 +101,8 @@ def export_command(
             vecnormalize=saved.vecnormalize,
             observations=observations,
             int8=int8 or False,
+            with_value=with_value,
+            stochastic=stochastic,
             eval_env=envs if int8 == "full" else None,
             force=force,
         )

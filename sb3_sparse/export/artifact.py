@@ -9,7 +9,7 @@ import shlex
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -18,9 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_sparse.errors import MissingExtra, UnsupportedError
+from sb3_sparse.errors import ConfigError, MissingExtra, UnsupportedError
 from sb3_sparse.export import numpy_policy
 from sb3_sparse.export.c import write_c
 from sb3_sparse.export.dense import write_dense
@@ -28,6 +27,7 @@ from sb3_sparse.export.graph import Graph
 from sb3_sparse.export.npz import write_npz
 from sb3_sparse.export.observations import Observations, count_of, row_of
 from sb3_sparse.export.parity import Actor, ParityError
+from sb3_sparse.export.reference import predictor
 from sb3_sparse.export.units import sort_units
 from sb3_sparse.policies.base import BaseSparsePolicy
 from sb3_sparse.policies.compiled import unwrapped
@@ -52,6 +52,28 @@ class Artifact:
     notes: tuple[str, ...] = ()
     sizes: dict[str, int] = field(default_factory=dict)
 
+    def write(self, main: Path) -> dict[Path, int]:
+        """Write all files, or none if one cannot be written; return their sizes.
+
+        :param main: path of the main file
+        :raises ConfigError: if one of them is a folder
+        """
+        main.parent.mkdir(parents=True, exist_ok=True)
+        paths = {
+            main.with_suffix(name) if name.startswith(".") else main.parent / name: content
+            for name, content in self.files.items()
+        }
+        with tempfile.TemporaryDirectory(dir=main.parent, prefix=".export_") as folder:
+            for path, content in paths.items():
+                if path.is_dir():
+                    raise ConfigError(
+                        f"{path} is a folder and cannot be written; give another name"
+                    )
+                (Path(folder) / path.name).write_bytes(content)
+            for path in paths:
+                (Path(folder) / path.name).replace(path)
+        return {path: len(content) for path, content in paths.items()}
+
 
 def c_artifact(graph: Graph, int8: bool) -> Artifact:
     """Write a C file and its header."""
@@ -75,10 +97,13 @@ def numpy_artifact(graph: Graph, int8: bool) -> Artifact:
             count = count_of(observations)
             if not graph.parts:
                 observations = np.reshape(observations, (count, *graph.observation_shape))
-            actions = policy(observations).reshape(count, -1)
-            first = row_of(observations, 0)
-            actions[0] = np.reshape(policy(first), -1)  # a single observation must work, too
-            return np.asarray(actions)
+            many = policy(observations)
+            one = policy(row_of(observations, 0))  # a single observation must work, too
+            if not graph.chosen:
+                many, one = (many,), (one,)
+            rows = _side_by_side(many, count)
+            rows[:1] = _side_by_side(one, 1)
+            return rows
 
         return run
 
@@ -106,12 +131,16 @@ def onnx_artifact(graph: Graph, int8: bool) -> Artifact:
             for name, shape, pixels in inputs_of(graph):
                 kind = np.uint8 if pixels else np.float32
                 inputs[name] = np.reshape(given[name], (-1, *shape)).astype(kind)
-            (actions,) = session.run(None, inputs)
-            return np.asarray(actions).reshape(count_of(observations), -1)
+            return _side_by_side(session.run(None, inputs), count_of(observations))
 
         return run
 
     return Artifact({".onnx": content}, actor)
+
+
+def _side_by_side(outputs: Sequence[NDArray[Any]], count: int) -> NDArray[Any]:
+    """Put outputs side by side in a row for each observation."""
+    return np.concatenate([np.reshape(output, (count, -1)) for output in outputs], axis=1)
 
 
 GRAPH_ARTIFACTS: dict[str, Callable[[Graph, bool], Artifact]] = {
@@ -153,19 +182,6 @@ def dense_artifact(model: BaseAlgorithm, normalised: bool) -> Artifact:
     return Artifact({".zip": content}, actor, tuple(notes))
 
 
-def predictor(model: BaseAlgorithm, normalization: VecNormalize | None) -> Actor:
-    """Return a function that normalises observations and calls the model's ``predict``."""
-
-    def run(observations: Observations) -> NDArray[Any]:
-        seen = observations
-        if normalization is not None:
-            seen = normalization.normalize_obs(observations)
-        actions, _ = model.predict(seen, deterministic=True)
-        return np.asarray(actions).reshape(count_of(observations), -1)
-
-    return run
-
-
 def compiler() -> list[str]:
     """Return the command of a C compiler: ``$CC``, else cc, gcc or clang.
 
@@ -190,7 +206,7 @@ def compiler() -> list[str]:
 def compiled(source: str, graph: Graph, options: tuple[str, ...] = OPTIONS) -> Actor:
     """Compile a policy; return a function that calls it through ctypes.
 
-    :param graph: gives the sizes of observation and action
+    :param graph: gives the sizes of observation and outputs
     """
     with tempfile.TemporaryDirectory() as folder:
         path, library = Path(folder) / "policy.c", Path(folder) / "policy.so"
@@ -212,14 +228,16 @@ def compiled(source: str, graph: Graph, options: tuple[str, ...] = OPTIONS) -> A
                 "unchecked with force (--force)"
             ) from error
     numbers = ctypes.POINTER(ctypes.c_float)
-    function.argtypes, function.restype = [numbers, numbers], None
-    count = graph.nodes[-1].shape[0]
+    sizes = list(graph.sizes.values())
+    starts = np.cumsum([0, *sizes[:-1]])
+    function.argtypes, function.restype = [numbers] * (1 + len(sizes)), None
 
     def run(observations: Observations) -> NDArray[Any]:
         rows = np.ascontiguousarray(graph.rows(observations).reshape(count_of(observations), -1))
-        actions = np.empty((len(rows), count), np.float32)
-        for row, action in zip(rows, actions, strict=True):
-            function(row.ctypes.data_as(numbers), action.ctypes.data_as(numbers))
-        return actions
+        results = np.empty((len(rows), sum(sizes)), np.float32)
+        for row, result in zip(rows, results, strict=True):
+            written = (result[start:].ctypes.data_as(numbers) for start in starts)
+            function(row.ctypes.data_as(numbers), *written)
+        return results
 
     return run

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sb3_sparse.export import ckernels
 from sb3_sparse.export.cfunctions import FUNCTIONS
-from sb3_sparse.export.cheader import PROTOTYPE, WIDTH, about, declarations
+from sb3_sparse.export.cheader import WIDTH, about, declarations, prototype
 from sb3_sparse.export.cintegers import integer_call
 from sb3_sparse.export.graph import Graph
 from sb3_sparse.export.integers import IntegerLinear, Lookup, Quantize
@@ -19,23 +19,23 @@ from sb3_sparse.export.layout import grouped, side_by_side
 from sb3_sparse.export.memory import Memory, bordered_shape, plan_memory
 from sb3_sparse.export.nodes import (
     Activation,
-    Add,
     Argmax,
     Concat,
     Conv,
     Flatten,
     Linear,
     MaxPool,
-    Multiply,
     Node,
     Normalize,
     OneHot,
+    Pairwise,
     PerUnit,
     Positive,
     Slice,
     Standardize,
     Weighted,
 )
+from sb3_sparse.export.output_nodes import Constant, Largest
 from sb3_sparse.export.quantize import quantize_rows
 
 BYTES = {
@@ -56,7 +56,7 @@ class CSource:
     :param source: text of the ``.c`` file
     :param header: text of the ``.h`` file
     :param flash: bytes of its constants, without some 1 to 3 KB of code
-    :param ram: bytes of its static memory, without the caller's observation and action
+    :param ram: bytes of its static memory, without the caller's observation and outputs
     """
 
     source: str
@@ -86,8 +86,8 @@ def write_c(graph: Graph, version: str, int8: bool = False) -> CSource:
     if any(f"{name}(" in functions for name in ckernels.MATH):
         includes = "#include <math.h>\n" + includes
     source = (
-        f"{comment}{includes}\n{PROTOTYPE};\n\n{memory}{functions}\n{tables}\n\n"
-        f"{PROTOTYPE}\n{{\n{body}\n}}\n"
+        f"{comment}{includes}\n{prototype(graph)};\n\n{memory}{functions}\n{tables}\n\n"
+        f"{prototype(graph)}\n{{\n{body}\n}}\n"
     )
     header = comment + declarations(graph)
     return CSource(source, header, writer.flash, ram)
@@ -124,6 +124,11 @@ class _Writer:
             self._call(node.op, x, y, len(node.sizes), sizes)
         elif isinstance(node, Standardize):
             self._call("standardize", x, y, _size(node), _number(node.eps))
+        elif isinstance(node, Largest):
+            self._call("largest", x, y, int(np.prod(self.graph.shape_of(node.inputs[0]))))
+        elif isinstance(node, Constant):
+            numbers = self._table("numbers", node.numbers, "float")
+            self._call("copy_each", numbers, y, _size(node))
         elif isinstance(node, Concat):
             start = 0
             for part in node.inputs:
@@ -139,7 +144,7 @@ class _Writer:
             self._elementwise(node, x, y, [_size(node)], fields)
         elif isinstance(node, Activation):
             self._elementwise(node, x, y, [_size(node)], node.fields())
-        elif isinstance(node, (Add, Multiply)):
+        elif isinstance(node, Pairwise):
             self._elementwise(node, x, y, [_size(node), self._place(node.inputs[1])], {})
         elif isinstance(node, Positive):
             self._elementwise(node, x, y, [_size(node)], {})
@@ -252,8 +257,9 @@ class _Writer:
     def _place(self, value: int) -> str:
         if value == 0:
             return "obs"
-        if value == len(self.graph.nodes):
-            return "action"
+        output = self.graph.name_of(value)
+        if output is not None:
+            return output
         if value not in self.memory.places:  # an observation, or a part of it, perhaps flattened
             node = self.graph.nodes[value - 1]
             before = self._place(node.inputs[0])

@@ -78,5 +78,15 @@ static void argmax(const float *x, float *y, uint32_t n, const uint32_t *size)
     }
 }
 """,
+    "largest": """\
+static void largest(const float *x, float *y, uint32_t n)
+{
+    float most = *x;
+    for (; n; n--, x++)
+        if (*x > most)
+            most = *x;
+    *y = most;
+}
+""",
 }
 """Their texts by name."""

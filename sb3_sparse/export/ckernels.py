@@ -101,6 +101,8 @@ ELEMENTWISE = {
     "relu": ("", "x[i] < 0.0f ? 0.0f : x[i]"),
     "leaky_relu": (", float slope", "x[i] < 0.0f ? slope * x[i] : x[i]"),
     "elu": (", float slope", "x[i] < 0.0f ? slope * expm1f(x[i]) : x[i]"),
+    "exp": ("", "expf(x[i])"),
+    "sqrt": ("", "sqrtf(x[i])"),
     "tanh": ("", "tanhf(x[i])"),
     "sigmoid": ("", "0.5f * tanhf(0.5f * x[i]) + 0.5f"),
     "silu": ("", "x[i] * (0.5f * tanhf(0.5f * x[i]) + 0.5f)"),
@@ -120,6 +122,7 @@ ELEMENTWISE = {
     "threshold": (", float most, float instead", "x[i] <= most ? instead : x[i]"),
     "add": (", const float *z", "x[i] + z[i]"),
     "multiply": (", const float *z", "x[i] * z[i]"),
+    "minimum": (", const float *z", "x[i] < z[i] ? x[i] : z[i]"),
     "positive": ("", "x[i] > 0.0f ? 1.0f : 0.0f"),
 }
 PER_UNIT = {

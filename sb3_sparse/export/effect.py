@@ -82,6 +82,6 @@ class _Player:
         deterministic: bool = False,
     ) -> tuple[NDArray[Any], None]:
         raw = raw_of(unwrap_vec_normalize(self.env), observation, self.observation_space)
-        actions = self.actor(raw)
-        shape = (count_of(raw), *(self.action_space.shape or ()))
-        return actions.reshape(shape).astype(self.action_space.dtype), None
+        shape = self.action_space.shape or ()
+        actions = self.actor(raw)[:, : int(np.prod(shape))]  # further outputs stand behind
+        return actions.reshape((count_of(raw), *shape)).astype(self.action_space.dtype), None

@@ -1,4 +1,4 @@
-"""Translates an SB3 model to the graph of its deterministic actions."""
+"""Translates an SB3 model to the graph of its actions and further outputs."""
 
 from __future__ import annotations
 
@@ -14,8 +14,11 @@ from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
 from sb3_sparse.errors import UnsupportedError
-from sb3_sparse.export.graph import Graph
-from sb3_sparse.export.nodes import Affine, Argmax, Clip, Linear, Positive
+from sb3_sparse.export.acted import Acted, module_of
+from sb3_sparse.export.distribution import distribution_outputs
+from sb3_sparse.export.estimate import mean_quantiles, value_output
+from sb3_sparse.export.graph import Graph, Output
+from sb3_sparse.export.nodes import Affine, Argmax, Clip, Positive
 from sb3_sparse.export.preprocess import observed, preprocessed
 from sb3_sparse.export.trace import Tracer
 from sb3_sparse.loading.zips import check_finite
@@ -23,11 +26,18 @@ from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.policies.registry import sparse_counterpart, supported_algorithms
 
 
-def graph_of(model: BaseAlgorithm, normalization: VecNormalize | None) -> Graph:
+def graph_of(
+    model: BaseAlgorithm,
+    normalization: VecNormalize | None,
+    with_value: bool = False,
+    stochastic: bool = False,
+) -> Graph:
     """Return the operations from a raw observation to ``predict(deterministic=True)``.
 
     :param model: a model of a supported algorithm, with a sparse or stock policy
     :param normalization: what normalises observations before the policy sees them
+    :param with_value: whether the estimated return is an output, too
+    :param stochastic: whether the parameters of the actions' distribution are
     :raises UnsupportedError: for a network or space that cannot be exported
     """
     policy: Any = unwrapped(model.policy)
@@ -39,38 +49,42 @@ def graph_of(model: BaseAlgorithm, normalization: VecNormalize | None) -> Graph:
     seen = observed(space)
     tracer = Tracer(seen.shape, {id(module): name for name, module in policy.named_modules()})
     value = preprocessed(tracer, space, normalization, policy.normalize_images)
-    try:
-        extractor, *modules = map(policy.get_submodule, sparse.acting)
-    except AttributeError as error:
-        raise UnsupportedError(
-            f"{type(policy).__name__} is not built as SB3's own policies are ({error}), so it "
-            "cannot be exported"
-        ) from error
-    if policy.squash_output and not _ends_in_tanh(modules[-1]):  # but its distribution squashes
-        modules.append(nn.Tanh())
-    result = tracer.walk(extractor, value)
+    extractor, *modules = (module_of(policy, name) for name in sparse.acting)
+    features = latent = result = tracer.walk(extractor, value)
     for module in modules:
-        result = tracer.walk(module, result)
-    action = model.action_space
+        latent, result = result, tracer.walk(module, result)
     if sparse.acting_quantiles:
-        quantiles = attrgetter(sparse.acting_quantiles)(policy)
-        result = _mean_quantiles(tracer, result, quantiles)
+        result = mean_quantiles(tracer, result, attrgetter(sparse.acting_quantiles)(policy))
+    squashed = result
+    if policy.squash_output and not _ends_in_tanh(modules[-1]):  # but its distribution squashes
+        squashed = tracer.walk(nn.Tanh(), result)
+    action = _action(tracer, squashed, policy, model.action_space)
+    shape = tuple(model.action_space.shape or ())
+    acted = Acted(policy, sparse, tracer, value, features, latent, result, squashed)
+    outputs = [Output("action", action, shape)]
+    if with_value:
+        outputs.append(value_output(acted))
+    if stochastic:
+        outputs += distribution_outputs(acted, shape)
+    chosen = tuple(outputs) if len(outputs) > 1 else ()
+    return Graph(seen.shape, tracer.finish(), shape, seen.pixels, seen.parts, chosen)
+
+
+def _action(tracer: Tracer, result: int, policy: Any, action: spaces.Space[Any]) -> int:
+    """Turn the result of the network into an action of the space, as SB3 does."""
     if isinstance(action, spaces.Box):
-        _box(tracer, result, policy, action)
-    elif isinstance(action, spaces.Discrete):
-        tracer.add(Argmax((result,), (1,), (int(action.n),)))
-    elif isinstance(action, spaces.MultiDiscrete) and action.nvec.ndim == 1:
+        return _box(tracer, result, policy, action)
+    if isinstance(action, spaces.Discrete):
+        return tracer.add(Argmax((result,), (1,), (int(action.n),)))
+    if isinstance(action, spaces.MultiDiscrete) and action.nvec.ndim == 1:
         sizes = tuple(int(n) for n in action.nvec)
-        tracer.add(Argmax((result,), (len(sizes),), sizes))
-    elif isinstance(action, spaces.MultiBinary):
-        tracer.add(Positive((result,), tracer.shape_of(result)))
-    else:
-        raise UnsupportedError(
-            f"actions in {action} cannot be exported; allowed are Box, Discrete, MultiDiscrete "
-            "(of one axis) and MultiBinary"
-        )
-    shape = action.shape or ()
-    return Graph(seen.shape, tracer.finish(), tuple(shape), seen.pixels, seen.parts)
+        return tracer.add(Argmax((result,), (len(sizes),), sizes))
+    if isinstance(action, spaces.MultiBinary):
+        return tracer.add(Positive((result,), tracer.shape_of(result)))
+    raise UnsupportedError(
+        f"actions in {action} cannot be exported; allowed are Box, Discrete, MultiDiscrete "
+        "(of one axis) and MultiBinary"
+    )
 
 
 def check_model(model: BaseAlgorithm) -> None:
@@ -100,21 +114,7 @@ def _ends_in_tanh(module: nn.Module) -> bool:
     return isinstance([*module.modules()][-1], nn.Tanh)
 
 
-def _mean_quantiles(tracer: Tracer, value: int, quantiles: int) -> int:
-    """Let the last layer compute the mean over quantiles, by which QR-DQN acts."""
-    last = tracer.nodes[value - 1]
-    if not isinstance(last, Linear):
-        raise UnsupportedError("a quantile network that does not end in a Linear layer")
-    actions = len(last.weight) // quantiles
-    weight = last.weight.astype(np.float64).reshape(quantiles, actions, -1).mean(axis=0)
-    bias = last.bias.astype(np.float64).reshape(quantiles, actions).mean(axis=0)
-    tracer.nodes[value - 1] = Linear(
-        last.inputs, (actions,), weight.astype(np.float32), bias.astype(np.float32)
-    )
-    return value
-
-
-def _box(tracer: Tracer, value: int, policy: Any, space: spaces.Box) -> None:
+def _box(tracer: Tracer, value: int, policy: Any, space: spaces.Box) -> int:
     """Clip or rescale the network's output to the action's bounds, as SB3 does."""
     low = space.low.reshape(-1).astype(np.float32)
     high = space.high.reshape(-1).astype(np.float32)
@@ -122,9 +122,9 @@ def _box(tracer: Tracer, value: int, policy: Any, space: spaces.Box) -> None:
     if policy.squash_output:
         scale = (0.5 * (high.astype(np.float64) - low)).astype(np.float32)
         if (scale != 1).any() or (low != -1).any():
-            tracer.add(Affine((value,), shape, scale, low + scale))
-    else:
-        tracer.add(Clip((value,), shape, low, high))
+            value = tracer.add(Affine((value,), shape, scale, low + scale))
+        return value
+    return tracer.add(Clip((value,), shape, low, high))
 
 
 def span_of(model: BaseAlgorithm) -> NDArray[np.float64]:

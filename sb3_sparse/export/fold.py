@@ -18,8 +18,8 @@ def fold(graph: Graph) -> Graph:
 
     Batch normalisation and the division of pixels by 255 disappear this way.
     """
-    for number in range(len(graph.nodes) - 1):
-        if not graph.users(number + 1):
+    for number in range(len(graph.nodes)):
+        if not graph.users(number + 1) and graph.name_of(number + 1) is None:
             return fold(rewrite(graph, {number: None}))
     for number, node in enumerate(graph.nodes):
         if isinstance(node, Affine):
@@ -44,14 +44,16 @@ def rewrite(graph: Graph, changed: Mapping[int, Node | None]) -> Graph:
             continue
         nodes.append(replace(new, inputs=inputs))
         places.append(len(nodes))
-    return replace(graph, nodes=tuple(nodes))
+    chosen = tuple(replace(one, value=places[one.value]) for one in graph.chosen)
+    return replace(graph, nodes=tuple(nodes), chosen=chosen)
 
 
 def _into_producer(graph: Graph, number: int, node: Affine) -> dict[int, Node]:
-    """Fold a node into the rows of the layer before, unless others read that layer's result."""
+    """Fold a node into the rows of the layer before, if nothing else needs that layer's result."""
     (value,) = node.inputs
     layer = graph.nodes[value - 1] if value else None
-    if not isinstance(layer, Weighted) or len(graph.users(value)) > 1:
+    needed = len(graph.users(value)) > 1 or graph.name_of(value) is not None
+    if not isinstance(layer, Weighted) or needed:
         return {}
     scale = node.scale.astype(np.float64)
     weight = layer.weight * scale.reshape(-1, *[1] * (layer.weight.ndim - 1))
@@ -62,6 +64,8 @@ def _into_producer(graph: Graph, number: int, node: Affine) -> dict[int, Node]:
 def _into_users(graph: Graph, number: int, node: Affine) -> dict[int, Node]:
     """Fold a node into the columns of its users, if all are layers without a border of zeros."""
     changed: dict[int, Node] = {}
+    if graph.name_of(number + 1) is not None:
+        return changed
     for user, layer in enumerate(graph.nodes):
         if number + 1 not in layer.inputs:
             continue

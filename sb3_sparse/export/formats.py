@@ -31,3 +31,23 @@ def check_int8(int8: object, to: str) -> str | None:
     if to != "c":
         raise ConfigError(f"int8 is for to='c' only, got to={to!r}")
     return str(chosen)
+
+
+def check_outputs(to: str, with_value: bool, stochastic: bool, int8: object = False) -> None:
+    """Reject further outputs of a format that has none.
+
+    :raises ConfigError: for ``"dense"``, and for ``int8="full"``
+    """
+    if not (with_value or stochastic):
+        return
+    asked = "with_value" if with_value else "stochastic"
+    if int8 == "full":
+        raise ConfigError(
+            f"{asked} has no whole numbers, got int8='full'; give int8='weights' (--int8 weights), "
+            "or leave one of them out"
+        )
+    if to == "dense":
+        raise ConfigError(
+            f"{asked} is for c, numpy and onnx, got to='dense': a zip of SB3 has its critics and "
+            "distributions anyway; load it, and call its policy"
+        )

@@ -1,4 +1,4 @@
-"""A deterministic policy as a list of operations, from which most formats are written."""
+"""A policy as a list of operations, from which most formats are written."""
 
 from __future__ import annotations
 
@@ -30,16 +30,34 @@ class Part:
         return int(np.prod(self.shape))
 
 
+@dataclass(frozen=True)
+class Output:
+    """A value that is written out.
+
+    :param name: ``"action"``, ``"value"``, ``"mean"``, ``"std"`` or ``"logits"``
+    :param value: number of the value
+    :param shape: shape for one observation, ``()`` for a single number
+    :param meaning: what a further output is, for the files' first lines
+    """
+
+    name: str
+    value: int
+    shape: tuple[int, ...]
+    meaning: str = ""
+
+
 @dataclass(frozen=True, eq=False)
 class Graph:
-    """A policy: from one observation to its action.
+    """A policy: from one observation to its action, and to further outputs.
 
     :param observation_shape: shape of one observation as the policy sees it (images channels
         first); a dict is one row that concatenates its parts
-    :param nodes: operations in execution order; the last result is the action
+    :param nodes: operations in execution order
     :param action_shape: shape of one action
     :param images: whether observations are uint8 images
     :param parts: the parts of a dict observation
+    :param chosen: the action, then the further outputs; empty: the last result is the action, and
+        there are no others
     """
 
     observation_shape: tuple[int, ...]
@@ -47,11 +65,27 @@ class Graph:
     action_shape: tuple[int, ...] = ()
     images: bool = False
     parts: tuple[Part, ...] = ()
+    chosen: tuple[Output, ...] = ()
+
+    @property
+    def outputs(self) -> tuple[Output, ...]:
+        """The action, then the further outputs."""
+        return self.chosen or (Output("action", len(self.nodes), self.action_shape),)
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """Number of elements of each output, by its name."""
+        return {one.name: int(np.prod(self.shape_of(one.value))) for one in self.outputs}
+
+    @property
+    def action(self) -> Node:
+        """The operation whose result is the action."""
+        return self.nodes[self.outputs[0].value - 1]
 
     @property
     def discrete(self) -> bool:
         """Whether actions are whole numbers."""
-        return isinstance(self.nodes[-1], (Argmax, Positive))
+        return isinstance(self.action, (Argmax, Positive))
 
     @property
     def layers(self) -> list[Weighted]:
@@ -66,6 +100,10 @@ class Graph:
     def shape_of(self, value: int) -> tuple[int, ...]:
         """Return the shape of a value; value 0 is the observation."""
         return self.nodes[value - 1].shape if value else self.observation_shape
+
+    def name_of(self, value: int) -> str | None:
+        """Return the name of a value that is an output; None for any other."""
+        return next((output.name for output in self.outputs if output.value == value), None)
 
     def users(self, value: int) -> list[Node]:
         """Return the nodes that read a value."""
@@ -87,6 +125,7 @@ class Graph:
         return values
 
     def run(self, observations: Any) -> NDArray[Any]:
-        """Compute the flat actions of a batch of observations, shape ``(batch, actions)``."""
-        result = np.moveaxis(self.values(observations)[-1], -1, 0)
-        return result.reshape(len(result), -1)
+        """Compute all outputs of a batch of observations, side by side in a row for each."""
+        values = self.values(observations)
+        results = [np.moveaxis(values[output.value], -1, 0) for output in self.outputs]
+        return np.concatenate([result.reshape(len(result), -1) for result in results], axis=1)

@@ -10,18 +10,17 @@ from sb3_sparse.export.graph import Graph
 from sb3_sparse.export.integers import Lookup
 from sb3_sparse.export.nodes import (
     Activation,
-    Add,
     Conv,
     Flatten,
     MaxPool,
-    Multiply,
     Node,
+    Pairwise,
     PerUnit,
     Slice,
     Standardize,
 )
 
-IN_PLACE = (Activation, PerUnit, Standardize, Add, Multiply, Lookup)
+IN_PLACE = (Activation, PerUnit, Standardize, Pairwise, Lookup)
 """Nodes that may overwrite an input that nothing reads later."""
 
 
@@ -77,11 +76,11 @@ def bordered_shape(node: Node, shape: tuple[int, ...]) -> tuple[int, ...] | None
 def plan_memory(graph: Graph) -> Memory:
     """Place each value first-fit, from the node that makes it until the last one that reads it.
 
-    The observation and the action belong to the caller and have no place.
+    The observation and the outputs belong to the caller and have no place.
     """
-    last_value = len(graph.nodes)
-    home = _homes(graph)
-    last_use = [0] * (last_value + 1)
+    outputs = {output.value for output in graph.outputs}
+    home = _homes(graph, outputs)
+    last_use = [0] * (len(graph.nodes) + 1)
     for value, node in enumerate(graph.nodes, start=1):
         for taken in node.inputs:
             last_use[home[taken]] = value
@@ -92,7 +91,7 @@ def plan_memory(graph: Graph) -> Memory:
         border = bordered_shape(node, graph.shape_of(node.inputs[0]))
         if border is not None:
             borders[value] = floats.place(int(np.prod(border)), value, value)
-        if home[value] == value and value != last_value:
+        if home[value] == value and value not in outputs:
             array = whole if node.whole else floats
             places[value] = array.place(int(np.prod(node.shape)), last_use[value], value)
         elif home[value] in places:
@@ -100,19 +99,21 @@ def plan_memory(graph: Graph) -> Memory:
     return Memory(floats.size, places, borders, whole.size)
 
 
-def _homes(graph: Graph) -> list[int]:
+def _homes(graph: Graph, outputs: set[int]) -> list[int]:
     """Return for each value the one whose place it uses: itself, or an input of its node."""
-    last_value = len(graph.nodes)
-    last_reader = [0] * (last_value + 1)
+    last_reader = [0] * (len(graph.nodes) + 1)
     for value, node in enumerate(graph.nodes, start=1):
         for taken in node.inputs:
             last_reader[taken] = value
-    home = list(range(last_value + 1))
-    for value, node in enumerate(graph.nodes[:-1], start=1):
+    home = list(range(len(graph.nodes) + 1))
+    for value, node in enumerate(graph.nodes, start=1):
+        if value in outputs:
+            continue
         if isinstance(node, (Flatten, Slice)):
             home[value] = home[node.inputs[0]]
         elif isinstance(node, IN_PLACE):
             needed = {home[before] for before in range(value) if last_reader[before] > value}
-            free = (home[taken] for taken in node.inputs if home[taken] not in {0, *needed})
+            needed |= {0, *outputs}
+            free = (home[taken] for taken in node.inputs if home[taken] not in needed)
             home[value] = next(free, value)
     return home

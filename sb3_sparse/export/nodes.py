@@ -208,14 +208,18 @@ class Flatten(Node):
     op = "flatten"
 
 
-class Add(Node):
+class Pairwise(Node):
+    """An operation on two values, element by element."""
+
+
+class Add(Pairwise):
     """The sum of two values."""
 
     op = "add"
 
 
-class Multiply(Node):
-    """The product of two values, element by element."""
+class Multiply(Pairwise):
+    """The product of two values."""
 
     op = "multiply"
 

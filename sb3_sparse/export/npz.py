@@ -13,7 +13,7 @@ from sb3_sparse.export.nodes import Node, Weighted
 
 
 def write_npz(graph: Graph) -> bytes:
-    """Return the bytes of the file: names and inputs of all nodes, and their arrays."""
+    """Return the bytes of the file: names and inputs of all nodes, their arrays, the outputs."""
     most = max(len(node.inputs) for node in graph.nodes)
     inputs = np.zeros((len(graph.nodes), most), np.int32)
     for row, node in zip(inputs, graph.nodes, strict=True):
@@ -27,6 +27,11 @@ def write_npz(graph: Graph) -> bytes:
         "keys": np.array([part.key for part in graph.parts], np.str_),
         "axes": np.array([len(part.shape) for part in graph.parts], np.int64),
     }
+    if graph.chosen:
+        arrays["outputs"] = np.array([one.name for one in graph.outputs])
+    for one in graph.chosen:
+        arrays[f"value.{one.name}"] = np.array(one.value, np.int64)
+        arrays[f"shape.{one.name}"] = np.array(one.shape, np.int64)
     for number, node in enumerate(graph.nodes):
         arrays.update({f"{number}.{name}": field for name, field in _fields(node).items()})
     file = io.BytesIO()

@@ -1,12 +1,13 @@
-"""Policy("policy.npz")(observation) is the action; needs NumPy, uses SciPy if it is there."""
+"""Policy("policy.npz")(observation) is the action, or a named tuple that begins with it."""
 
 import math
+from collections import namedtuple
 
 import numpy as np
 
 try:
     from scipy.sparse import csr_array
-except ImportError:  # the same sums by a dense product
+except ImportError:  # NumPy alone computes the same sums by a dense product
 
     def csr_array(csr, shape):
         dense = np.zeros(shape, np.float32)
@@ -32,6 +33,8 @@ OPERATIONS = {  # of a node's arrays and its inputs, whose last axis is the batc
     "relu": lambda n, x: np.maximum(x, 0),
     "leaky_relu": lambda n, x: np.where(x > 0, x, x * n["slope"]),
     "elu": lambda n, x: np.where(x > 0, x, n["slope"] * np.expm1(np.minimum(x, 0))),
+    "exp": lambda n, x: np.exp(x),
+    "sqrt": lambda n, x: np.sqrt(x),
     "tanh": lambda n, x: np.tanh(x),
     "sigmoid": lambda n, x: 0.5 * np.tanh(0.5 * x) + 0.5,
     "silu": lambda n, x: x * (0.5 * np.tanh(0.5 * x) + 0.5),
@@ -59,6 +62,9 @@ OPERATIONS = {  # of a node's arrays and its inputs, whose last axis is the batc
     "standardize": lambda n, x: (x - x.mean(0)) / np.sqrt(x.var(0) + n["eps"]),
     "add": lambda n, x, y: x + y,
     "multiply": lambda n, x, y: x * y,
+    "minimum": lambda n, x, y: np.minimum(x, y),
+    "largest": lambda n, x: x.max(0, keepdims=True),
+    "constant": lambda n, x: np.repeat(n["numbers"], x.shape[-1], -1),
     "argmax": lambda n, x: np.stack([p.argmax(0) for p in np.split(x, n["splits"])]),
     "positive": lambda n, x: (x > 0).astype(np.int64),
 }
@@ -67,7 +73,11 @@ OPERATIONS = {  # of a node's arrays and its inputs, whose last axis is the batc
 class Policy:  # takes one observation, or many: one a row; or a dict of them
     def __init__(self, path):
         with np.load(path) as file:
-            self.shapes, self.nodes = (file["observation"], file["action"]), []
+            self.shape, self.nodes = file["observation"], []
+            names = file["outputs"].tolist() if "outputs" in file else []
+            self.outputs = [(file[f"value.{n}"], file[f"shape.{n}"]) for n in names]
+            self.outputs = self.outputs or [(-1, file["action"])]
+            self.named = namedtuple("Outputs", names) if names else lambda action: action
             self.parts = list(zip(file["keys"], file["axes"]))
             for i, (op, inputs) in enumerate(zip(file["ops"], file["inputs"])):
                 n = {k.split(".")[1]: file[k] for k in file.files if k.startswith(f"{i}.")}
@@ -81,8 +91,9 @@ class Policy:  # takes one observation, or many: one a row; or a dict of them
             rows = [x.reshape(*x.shape[: x.ndim - axes], -1) for x, axes in parts]
             observation = np.concatenate(rows, -1)
         x = np.asarray(observation, np.float32)
-        values = [np.moveaxis(x.reshape(-1, *self.shapes[0]), 0, -1)]
+        values = [np.moveaxis(x.reshape(-1, *self.shape), 0, -1)]
         for operation, n, inputs in self.nodes:
             values.append(operation(n, *(values[i] for i in inputs)))
-        many = x.shape[: x.ndim - len(self.shapes[0])]
-        return np.moveaxis(values[-1], -1, 0).reshape((*many, *self.shapes[1]))
+        many = x.shape[: x.ndim - len(self.shape)]
+        rows = (np.moveaxis(values[v], -1, 0).reshape((*many, *s)) for v, s in self.outputs)
+        return self.named(*rows)

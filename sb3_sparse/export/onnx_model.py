@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from onnx import TensorProto, checker, helper
 
-from sb3_sparse.export.graph import Graph
+from sb3_sparse.export.graph import Graph, Output
 from sb3_sparse.export.nodes import (
     Activation,
     Add,
@@ -24,18 +24,24 @@ from sb3_sparse.export.nodes import (
     Node,
     Normalize,
     OneHot,
+    Pairwise,
+    Positive,
     Slice,
     Slopes,
     Standardize,
 )
 from sb3_sparse.export.onnx_writer import OnnxWriter
+from sb3_sparse.export.output_nodes import Constant, Largest, Minimum
 
 OPSET = 17
 IR_VERSION = 8
+PAIRWISE: dict[type[Node], str] = {Add: "Add", Multiply: "Mul", Minimum: "Min"}
 
 
 def write_onnx(graph: Graph, version: str) -> bytes:
-    """Return the bytes of a model with one input, ``obs``, and one output, ``action``.
+    """Return the bytes of a model with one input, ``obs``, and the output ``action``.
+
+    Further outputs are named, too: ``value``, ``mean``, ``std`` and ``logits``, all float32.
 
     Both are batched. A dict observation has an input for each key, named after the key. Images are
     uint8, other observations float32; actions are float32, or int64 if they are whole numbers.
@@ -54,14 +60,14 @@ def write_onnx(graph: Graph, version: str) -> bytes:
     for value, node in enumerate(graph.nodes, start=1):
         inputs = [_name(taken, graph) for taken in node.inputs]
         writer.write(node, inputs, f"value_{value}")
-    last = f"value_{len(graph.nodes)}"
-    writer.node("Reshape", [last, writer.array([-1, *graph.action_shape], np.int64)], "action")
-    numbers = TensorProto.INT64 if graph.discrete else TensorProto.FLOAT
+    for one in graph.outputs:
+        shape = writer.array([-1, *one.shape], np.int64)
+        writer.node("Reshape", [f"value_{one.value}", shape], one.name)
     made = helper.make_graph(
         writer.nodes,
         "policy",
         [_input(*asked) for asked in inputs_of(graph)],
-        [helper.make_tensor_value_info("action", numbers, ["batch", *graph.action_shape])],
+        [_output(one, graph) for one in graph.outputs],
         writer.arrays,
     )
     model = helper.make_model(
@@ -86,6 +92,12 @@ def inputs_of(graph: Graph) -> list[tuple[str, tuple[int, ...], bool]]:
 def _input(name: str, shape: tuple[int, ...], pixels: bool) -> Any:
     kind = TensorProto.UINT8 if pixels else TensorProto.FLOAT
     return helper.make_tensor_value_info(name, kind, ["batch", *shape])
+
+
+def _output(output: Output, graph: Graph) -> Any:
+    whole = output.name == "action" and graph.discrete
+    kind = TensorProto.INT64 if whole else TensorProto.FLOAT
+    return helper.make_tensor_value_info(output.name, kind, ["batch", *output.shape])
 
 
 def _name(value: int, graph: Graph) -> str:
@@ -138,8 +150,15 @@ class _GraphWriter(OnnxWriter):
             self.node(kinds[1], [half, self.array(second)], output)
         elif isinstance(node, Flatten):
             self.node("Flatten", inputs, output)
-        elif isinstance(node, (Add, Multiply)):
-            self.node("Add" if isinstance(node, Add) else "Mul", inputs, output)
+        elif isinstance(node, Pairwise):
+            self.node(PAIRWISE[type(node)], inputs, output)
+        elif isinstance(node, Largest):
+            self.node("ReduceMax", inputs, output, axes=[1], keepdims=1)
+        elif isinstance(node, Constant):
+            count = self.node("Shape", inputs, f"{output}_count", start=0, end=1)
+            whole = [count, self.array(node.shape, np.int64)]
+            self.node("Concat", whole, f"{output}_shape", axis=0)
+            self.node("Expand", [self.array(node.numbers), f"{output}_shape"], output)
         elif isinstance(node, Standardize):
             ones = self.array(np.ones(node.shape))
             self.node("LayerNormalization", [*inputs, ones], output, epsilon=node.eps)
@@ -155,6 +174,7 @@ class _GraphWriter(OnnxWriter):
         elif isinstance(node, Argmax):
             self._argmax(node, inputs[0], output)
         else:
+            assert isinstance(node, Positive)
             positive = self.node("Greater", [*inputs, self.array(0.0)], f"{output}_positive")
             self.node("Cast", [positive], output, to=TensorProto.INT64)
 

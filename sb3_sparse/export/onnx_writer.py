@@ -15,6 +15,8 @@ OPERATORS = {
     "relu": "Relu",
     "leaky_relu": "LeakyRelu",
     "elu": "Elu",
+    "exp": "Exp",
+    "sqrt": "Sqrt",
     "tanh": "Tanh",
     "sigmoid": "Sigmoid",
     "softsign": "Softsign",

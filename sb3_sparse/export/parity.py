@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,7 +13,7 @@ from sb3_sparse.errors import SparsityError
 from sb3_sparse.export.observations import Observations, count_of, rows_of
 
 Actor = Callable[[Observations], NDArray[Any]]
-"""Maps raw observations, one per row, to flat actions, one per row."""
+"""Maps raw observations, one per row, to flat actions, one per row; further outputs beside them."""
 TOLERANCE = 1e-5
 BATCH = 64
 
@@ -32,7 +32,9 @@ class Parity:
         half the range that an action is squashed into
     :param different: number of observations for which discrete actions differ
     :param discrete: whether actions are discrete, so that ``different`` counts
-    :param worst: the observation with the largest difference
+    :param worst: the observation for which actions differ most
+    :param further: largest ``|a - b|`` of each further output, by its name, divided by its largest
+        ``|a|`` for any observation, or by 1 if that is smaller
 
     Example::
 
@@ -47,19 +49,24 @@ class Parity:
     different: int
     discrete: bool
     worst: Observations | None = field(default=None, repr=False, compare=False)
+    further: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def holds(self) -> bool:
         """Whether the two policies are equal up to rounding."""
-        return self.different == 0 if self.discrete else self.difference <= TOLERANCE
+        act = self.different == 0 if self.discrete else self.difference <= TOLERANCE
+        return act and all(difference <= TOLERANCE for difference in self.further.values())
 
     def __str__(self) -> str:
         counts = {"recorded": self.recorded, "random": self.random}
         seen = " and ".join(f"{count} {kind}" for kind, count in counts.items() if count)
         seen = f"{seen or 'no'} observations"
         if self.discrete:
-            return f"actions differ for {self.different} of {seen}"
-        return f"largest difference {self.difference:.1e} on {seen}"
+            text = f"actions differ for {self.different} of {seen}"
+        else:
+            text = f"largest difference {self.difference:.1e} on {seen}"
+        further = [f"{name} {difference:.1e}" for name, difference in self.further.items()]
+        return f"{text}; largest difference of {', '.join(further)}" if further else text
 
 
 def compare(
@@ -69,18 +76,25 @@ def compare(
     random: Observations | None,
     discrete: bool,
     span: NDArray[Any] | float = 0.0,
+    further: Mapping[str, int] | None = None,
 ) -> Parity:
     """Run both policies on all observations.
 
     :param recorded: observations recorded in an environment; None: none
     :param random: random observations; None: none
     :param span: see :class:`Parity`, shape ``(actions,)``; rounding errors grow with it
+    :param further: number of elements of each further output, by its name
     """
     difference, different, worst = 0.0, 0, None
+    others = {name: _Largest() for name in further or {}}
+    behind = np.cumsum([*(further or {}).values()][::-1])[::-1]
+    """Columns from the beginning of each further output to the end of the row."""
     for observations in (recorded, random):
         for first in range(0, count_of(observations), BATCH):
             batch = rows_of(observations, first, first + BATCH)
-            ours, theirs = (actor(batch).astype(np.float64) for actor in (model, exported))
+            both = (actor(batch).astype(np.float64) for actor in (model, exported))
+            parts = (np.split(rows, -behind, axis=1) for rows in both)
+            (ours, theirs), *pairs = zip(*parts, strict=True)
             apart = np.abs(ours - theirs) / np.maximum(np.maximum(1.0, span), np.abs(ours))
             apart = np.where(np.isnan(apart), np.inf, apart).max(axis=1)
             different += int((apart > 0).sum())
@@ -88,4 +102,26 @@ def compare(
                 difference = float(apart.max())
                 row = int(apart.argmax())
                 worst = rows_of(batch, row, row + 1)
-    return Parity(count_of(recorded), count_of(random), difference, different, discrete, worst)
+            for largest, pair in zip(others.values(), pairs, strict=True):
+                largest.see(*pair)
+    seen = (count_of(recorded), count_of(random))
+    beside = {name: largest.difference for name, largest in others.items()}
+    return Parity(*seen, difference, different, discrete, worst, beside)
+
+
+class _Largest:
+    """The largest difference of a further output, and its largest number."""
+
+    def __init__(self) -> None:
+        self.apart, self.size = 0.0, 1.0
+
+    def see(self, ours: NDArray[Any], theirs: NDArray[Any]) -> None:
+        """Take a batch into account."""
+        apart = np.abs(ours - theirs)
+        self.apart = max(self.apart, float(np.where(np.isnan(apart), np.inf, apart).max()))
+        self.size = max(self.size, float(np.abs(ours).max()))
+
+    @property
+    def difference(self) -> float:
+        """The difference, relative to the size."""
+        return self.apart / self.size if np.isfinite(self.size) else np.inf

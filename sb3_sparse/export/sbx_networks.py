@@ -152,7 +152,8 @@ def _train_critics(source: Any, target: Any) -> None:
     if source.layer_norm or source.dropout_rate:
         raise UnsupportedError(
             "critics with layer_norm or dropout_rate have no counterpart in SB3, so the model "
-            "cannot train there; export to c, numpy or onnx instead, which need no critic"
+            "cannot train there; export to c, numpy or onnx instead, which need no critic without "
+            "with_value (--with-value)"
         )
     for networks, kind in ((target.critic, "params"), (target.critic_target, "target_params")):
         for network, tree in zip(networks.q_networks, _critics(source, kind), strict=True):

@@ -17,6 +17,7 @@ from sb3_sparse.export.builder import GraphBuilder
 from sb3_sparse.export.forward import trace_forward
 from sb3_sparse.export.nodes import (
     Affine,
+    Concat,
     Conv,
     Flatten,
     Floats,
@@ -152,7 +153,7 @@ class Tracer(GraphBuilder):
         deviation = np.sqrt(_array(getattr(module, var)).astype(np.float64) + module.eps)
         shape = self.shape_of(value)
         if (
-            self.sources(value)[-1] == 0
+            self._has_observation(value)
             and len(shape) == 1
             and (np.abs(centre) > FAR * deviation).any()
         ):
@@ -166,6 +167,12 @@ class Tracer(GraphBuilder):
         scale = scale / deviation
         shift = shift - centre * scale
         return self.add(Affine((value,), shape, scale.astype(np.float32), shift.astype(np.float32)))
+
+    def _has_observation(self, value: int) -> bool:
+        """Tell whether a value is the observation, perhaps beside others, as critics read it."""
+        node = self.nodes[value - 1] if value else None
+        parts = node.inputs if isinstance(node, Concat) else (value,)
+        return any(self.sources(part)[-1] == 0 for part in parts)
 
 
 def _does(module: nn.Module, *kinds: type[Module]) -> TypeGuard[Module]:

@@ -13,22 +13,26 @@ from sb3_sparse.export.fold import with_weights
 from sb3_sparse.export.graph import Graph
 from sb3_sparse.export.nodes import (
     Activation,
-    Add,
+    Argmax,
     Concat,
     Conv,
     Flatten,
     Linear,
     MaxPool,
-    Multiply,
     Node,
     Normalize,
+    Pairwise,
     PerUnit,
+    Positive,
     Standardize,
     Weighted,
 )
+from sb3_sparse.export.output_nodes import Largest
 
 UNIT_BY_UNIT = (Activation, PerUnit, Flatten, MaxPool, Normalize)
 """Nodes whose result has the same units as their input."""
+ALL_UNITS = (Pairwise, Concat, Standardize, Argmax, Largest, Positive)
+"""Nodes that need all units of their inputs, even constant ones."""
 
 
 def remove_dead_units(graph: Graph) -> Graph:
@@ -36,7 +40,8 @@ def remove_dead_units(graph: Graph) -> Graph:
 
     A unit without active inputs, or with constant ones only, has a constant value, which is added
     to the biases of the layers that read it. A unit that nothing reads is removed together with its
-    connections. Observations, actions and the ends of residual connections keep all their units.
+    connections. Observations, outputs, their scores and the ends of residual connections keep all
+    their units.
     """
     constants = _Constants(graph)
     nodes = [
@@ -116,7 +121,7 @@ class _Constants:
                 self.source[value] = self.source[node.inputs[0]]
             if isinstance(node, Weighted):
                 self.known[value] = self._of_layer(node)
-            elif isinstance(node, (Add, Multiply, Concat, Standardize)):
+            elif isinstance(node, ALL_UNITS):
                 for operand in node.inputs:
                     self.pinned[self.source[operand]][:] = True
                 self.pinned[value][:] = True
@@ -130,8 +135,7 @@ class _Constants:
             elif isinstance(node, (Activation, PerUnit)):
                 known = self.known[node.inputs[0]]
                 self.known[value] = node.run(known[:, None, None, None])[:, 0, 0, 0]
-        outputs = graph.nodes[-1].inputs if graph.discrete else (len(graph.nodes),)
-        for value in (0, *outputs):
+        for value in (0, *(output.value for output in graph.outputs)):
             self.pinned[self.source[value]][:] = True
 
     def _of_layer(self, layer: Weighted) -> NDArray[np.float64]:

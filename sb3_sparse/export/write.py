@@ -2,26 +2,24 @@
 
 from __future__ import annotations
 
-import tempfile
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from torch import nn
 
 from sb3_sparse.errors import ConfigError, MissingExtra, UnsupportedError
-from sb3_sparse.export.artifact import GRAPH_ARTIFACTS, Artifact, dense_artifact, predictor
+from sb3_sparse.export.artifact import GRAPH_ARTIFACTS, dense_artifact
 from sb3_sparse.export.calibrate import integer_graph
 from sb3_sparse.export.effect import Returns, play_both
 from sb3_sparse.export.extract import check_model, graph_of, span_of
+from sb3_sparse.export.failure import failure_of
 from sb3_sparse.export.fold import fold
-from sb3_sparse.export.formats import check_format, check_int8
+from sb3_sparse.export.formats import check_format, check_int8, check_outputs
 from sb3_sparse.export.graph import Graph
-from sb3_sparse.export.nodes import Argmax
 from sb3_sparse.export.observations import (
     Observations,
     check_recorded,
@@ -29,8 +27,9 @@ from sb3_sparse.export.observations import (
     has_images,
     random_observations,
 )
-from sb3_sparse.export.parity import TOLERANCE, Parity, ParityError, compare
+from sb3_sparse.export.parity import Parity, ParityError, compare
 from sb3_sparse.export.quantize import quantized
+from sb3_sparse.export.reference import predictor
 from sb3_sparse.export.sbx import NOT_CARRIED, as_sb3, is_sbx_model
 from sb3_sparse.export.units import remove_dead_units, units_of
 from sb3_sparse.loading.statistics import read_statistics
@@ -51,9 +50,10 @@ class ExportReport:
     :param returns: what they do to the return; None: not played
     :param sizes: bytes needed where the policy runs, by kind (``"flash"``, ``"RAM"``)
     :param notes: what the user must know
-    :param nnz: connections of the acting network that are not 0; for ``"dense"``, of all networks
+    :param nnz: connections of the exported networks that are not 0; for ``"dense"``, of all
+        networks
     :param exported_nnz: those left once dead units are removed
-    :param dense_bytes: float32 weights and biases of the acting network if it were dense; 0 for
+    :param dense_bytes: float32 weights and biases of these networks if they were dense; 0 for
         ``"dense"``, as the counts of units
     :param removed_units: number of dead units
     :param units: number of units before
@@ -106,6 +106,8 @@ def export_policy(
     vecnormalize: VecNormalize | str | Path | None = None,
     observations: Observations | None = None,
     int8: bool | str = False,
+    with_value: bool = False,
+    stochastic: bool = False,
     eval_env: VecEnv | None = None,
     force: bool = False,
 ) -> ExportReport:
@@ -128,15 +130,23 @@ def export_policy(
         check then compares with the rounded policy, and the report tells how actions change
     :param eval_env: for ``int8``: environments with the model's wrappers, in which the model and
         the exported policy play 20 episodes each for the report
+    :param with_value: not for ``"dense"``: write an estimate of the return, too, as the output
+        ``value``. It is V(s) of PPO, A2C and TRPO; of other algorithms Q(s, a) of the action:
+        the mean over quantiles of QRDQN, over all critics' quantiles of TQC, else the minimum over
+        critics
+    :param stochastic: not for ``"dense"``: write the distribution that training samples actions
+        from, too: the outputs ``mean`` and ``std`` of Gaussians (before the tanh of SAC, TQC and
+        CrossQ), or ``logits``. The output ``action`` stays the deterministic one
     :param force: write the files even if the check fails or cannot run
     :raises ConfigError: for a value that is not allowed
-    :raises UnsupportedError: for an algorithm, network or space that cannot be exported, or if
-        there is no C compiler for the check
+    :raises UnsupportedError: for an algorithm, network or space that cannot be exported, for a
+        distribution of an algorithm that has none, or if there is no C compiler for the check
     :raises CorruptStateError: if the file given as ``vecnormalize`` is damaged
     :raises Diverged: if weights are not finite
     :raises ParityError: if the export does not act as the model: if continuous actions differ by
         more than 1e-5, relative to their size above 1 and to the range they are squashed into, or
-        if any discrete action differs
+        if any discrete action differs; or if further outputs differ by more than 1e-5, relative to
+        their largest size above 1
     """
     check_format(to)
     bits = check_int8(int8, to)
@@ -147,9 +157,10 @@ def export_policy(
         )
     if eval_env is not None and bits is None:
         raise ConfigError("eval_env shows what int8 does to the return; give int8, too")
+    check_outputs(to, with_value, stochastic, int8)
     given = model
     if is_sbx_model(given):
-        model = as_sb3(given, whole=to == "dense")
+        model = as_sb3(given, whole=to == "dense" or with_value)
     check_model(model)
     space = model.observation_space
     normalization = normalization_of(given, vecnormalize)
@@ -160,22 +171,29 @@ def export_policy(
         normalization = written = rounded = None  # a zip of SB3 does not normalise by itself
         nnz = _connections(model)
         counts = {"nnz": nnz, "exported_nnz": nnz}
+        further = {}
     else:
         if normalization is not None:
             check_statistics(space, normalization)
-        raw = graph_of(model, normalization)
+        raw = graph_of(model, normalization, with_value, stochastic)
         exact = remove_dead_units(fold(raw))
         written = integer_graph(exact, observations) if bits == "full" else exact
         artifact = GRAPH_ARTIFACTS[to](written, bits is not None)
         rounded = quantized(written).run if bits else None
         counts = _counts(raw, exact)
+        _, *others = exact.sizes.items()
+        further = dict(others)
     path = main_file(Path(path), next(iter(artifact.files)))
     checked = partial(
-        compare, discrete=not isinstance(model.action_space, spaces.Box), span=span_of(model)
+        compare,
+        discrete=not isinstance(model.action_space, spaces.Box),
+        span=span_of(model),
+        further=further,
     )
     count = RANDOM_IMAGES if has_images(space) else RANDOM
     random = random_observations(space, normalization, count)
-    own, notes = predictor(given, normalization), list(artifact.notes)
+    own = predictor(given, normalization, list(further), unwrapped(model.policy))
+    notes = list(artifact.notes)
     if to == "dense" and model is not given:
         notes.append(NOT_CARRIED)
     parity = rounding = returns = None
@@ -191,7 +209,7 @@ def export_policy(
             met = None if bits == "full" else random
             rounding = checked(own, actor, observations, met)
     if parity is not None and not parity.holds:
-        failure = _failure(parity, written)
+        failure = failure_of(parity, written)
         if not force:
             raise ParityError(
                 f"the export to {to!r} does not act as the model: {failure}. Nothing was written; "
@@ -201,7 +219,7 @@ def export_policy(
     if eval_env is not None and rounding is not None:
         returns = play_both(own, actor, eval_env, space, model.action_space)
     return ExportReport(
-        files=_write(artifact, path),
+        files=artifact.write(path),
         parity=parity,
         rounding=rounding,
         returns=returns,
@@ -268,32 +286,3 @@ def main_file(path: Path, suffix: str) -> Path:
     if path.suffix:
         raise ConfigError(f"the file must end in {suffix}, got {path}")
     return path.with_suffix(suffix)
-
-
-def _failure(parity: Parity, graph: Graph | None) -> str:
-    """Describe the difference, and how close the scores are, since a tie may go either way."""
-    text = f"{parity} (allowed: {'0' if parity.discrete else TOLERANCE})"
-    if graph is None or not isinstance(graph.nodes[-1], Argmax):
-        return text
-    assert parity.worst is not None
-    scores = graph.values(parity.worst)[-2][:, 0]
-    parts = np.split(scores, np.cumsum(graph.nodes[-1].sizes)[:-1])
-    gap = min(float(np.diff(np.sort(part)[-2:])[0]) for part in parts if part.size > 1)
-    return f"{text}; at one of them the two best actions are {gap:.1e} apart in score"
-
-
-def _write(artifact: Artifact, main: Path) -> dict[Path, int]:
-    """Write all files, or none if one cannot be written; return their sizes."""
-    main.parent.mkdir(parents=True, exist_ok=True)
-    paths = {
-        main.with_suffix(name) if name.startswith(".") else main.parent / name: content
-        for name, content in artifact.files.items()
-    }
-    with tempfile.TemporaryDirectory(dir=main.parent, prefix=".export_") as folder:
-        for path, content in paths.items():
-            if path.is_dir():
-                raise ConfigError(f"{path} is a folder and cannot be written; give another name")
-            (Path(folder) / path.name).write_bytes(content)
-        for path in paths:
-            (Path(folder) / path.name).replace(path)
-    return {path: len(content) for path, content in paths.items()}

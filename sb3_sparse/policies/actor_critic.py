@@ -49,6 +49,8 @@ class SparseActorCriticPolicy(BaseSparsePolicy, ActorCriticPolicy):
     """
 
     acting = ("pi_features_extractor", *ACTOR)
+    estimate = "output"
+    valuing = ("vf_features_extractor", *CRITIC)
     networks = {
         "actor": NetworkSpec(
             roots=("pi_features_extractor", "mlp_extractor.policy_net", "action_net"),

@@ -68,6 +68,13 @@ class BaseSparsePolicy(DenseVectors, FastPredict):
     acting_quantiles: ClassVar[str] = ""
     """Attribute with the number of quantiles for each action, of whose mean the policy takes the
     best; empty: it has none."""
+    estimate: ClassVar[str] = ""
+    """What estimates the return beside the action: the ``"output"`` of :attr:`valuing`; the
+    ``"largest"`` score of an action; the ``"min"`` or the ``"mean"`` over critics of the
+    observation and the action; empty: nothing."""
+    valuing: ClassVar[tuple[str, ...]] = ()
+    """Names of the modules that estimate the return, if those of :attr:`acting` do not: the
+    features extractor, then those of the network, or the module with the critics."""
     action_spaces: ClassVar[tuple[type[spaces.Space[Any]], ...]] = (
         spaces.Box,
         spaces.Discrete,

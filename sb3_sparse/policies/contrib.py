@@ -63,6 +63,7 @@ class SparseTQCPolicy(SparseCriticsMixin, TQCPolicy):
     """
 
     acting = GAUSSIAN_ACTING
+    estimate = "mean"
     actor_class = SparseTQCActor
     critic_class = SparseTQCCritic
     networks = {"actor": GAUSSIAN_ACTOR, "critic": TWIN_CRITIC}
@@ -130,6 +131,7 @@ class SparseQRDQNPolicy(PredictsByModule, BaseSparsePolicy, QRDQNPolicy):
 
     acting = ("quantile_net.features_extractor", "quantile_net.quantile_net")
     acting_quantiles = "quantile_net.n_quantiles"
+    estimate = "largest"
     action_spaces = (spaces.Discrete,)
     quantile_net_class: ClassVar[type[SparseQuantileNetwork]] = SparseQuantileNetwork
     quantile_net: SparseQuantileNetwork

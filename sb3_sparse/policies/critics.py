@@ -51,6 +51,8 @@ class SparseContinuousCritic(SparseCritic, ContinuousCritic):
 class SparseCriticsMixin(PredictsByModule, BaseSparsePolicy):
     """Policies of algorithms with an actor and critics of its actions."""
 
+    estimate = "min"
+    valuing = ("critic.features_extractor", "critic")
     action_spaces = (spaces.Box,)
     actor_class: ClassVar[type[ActingModule]]
     critic_class: ClassVar[type[SparseCritic]] = SparseContinuousCritic

@@ -52,6 +52,7 @@ class SparseDQNPolicy(PredictsByModule, BaseSparsePolicy, DQNPolicy):
     """
 
     acting = ("q_net.features_extractor", "q_net.q_net")
+    estimate = "largest"
     action_spaces = (spaces.Discrete,)
     q_net_class: ClassVar[type[SparseQNetwork]] = SparseQNetwork
     q_net: SparseQNetwork

@@ -16,12 +16,13 @@ from torch import nn
 from sb3_sparse import sparsify
 from sb3_sparse.errors import ConfigError, UnsupportedError
 from sb3_sparse.export import FORMATS, export_policy, record_observations
-from sb3_sparse.export.artifact import compiled, predictor
+from sb3_sparse.export.artifact import compiled
 from sb3_sparse.export.extract import graph_of
 from sb3_sparse.export.fold import fold
 from sb3_sparse.export.graph import Graph
 from sb3_sparse.export.nodes import Concat, Positive, Slice
 from sb3_sparse.export.numpy_policy import Policy
+from sb3_sparse.export.reference import predictor
 from sb3_sparse.policies.saving import load_without_buffer
 
 PARTS = {

@@ -12,7 +12,7 @@ from support import TinyImages, make
 
 from sb3_sparse.errors import ConfigError, UnsupportedError
 from sb3_sparse.export import Returns, export_policy, record_observations
-from sb3_sparse.export.artifact import OPTIONS, compiled, predictor
+from sb3_sparse.export.artifact import OPTIONS, compiled
 from sb3_sparse.export.c import write_c
 from sb3_sparse.export.calibrate import integer_graph
 from sb3_sparse.export.effect import play_both
@@ -21,6 +21,7 @@ from sb3_sparse.export.graph import Graph
 from sb3_sparse.export.integers import Dequantized, Lookup, Quantize, Requantized
 from sb3_sparse.export.nodes import Activation, Add, Standardize
 from sb3_sparse.export.quantize import quantized
+from sb3_sparse.export.reference import predictor
 
 MAIN = """
 #include <stdio.h>

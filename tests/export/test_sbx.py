@@ -157,6 +157,30 @@ def test_a_dense_zip_has_critics_targets_and_the_entropy_coefficient(trained, tm
     assert not stock.actor.optimizer.state_dict()["state"]
 
 
+def test_values_and_distributions_are_those_of_sbx(trained, tmp_path):
+    model = trained["sac"]
+    export_policy(model, tmp_path / "policy", "numpy", with_value=True, stochastic=True)
+    seen = observations(model)
+    action, value, mean, std = Policy(tmp_path / "policy.npz")(seen)
+    policy, low, high = model.policy, model.action_space.low, model.action_space.high
+    scaled = 2 * (action - low) / (high - low) - 1
+    dropout = {"dropout": jax.random.PRNGKey(0)}
+    estimates = policy.qf.apply(policy.qf_state.params, seen, scaled, rngs=dropout)
+    np.testing.assert_allclose(value, np.asarray(estimates).min(axis=0)[:, 0], atol=1e-5)
+    gaussian = policy.actor.apply(policy.actor_state.params, seen).distribution
+    np.testing.assert_allclose(mean, gaussian.mean(), atol=1e-5)
+    np.testing.assert_allclose(std, gaussian.stddev(), atol=1e-5)
+    model = trained["ppo"]
+    export_policy(model, tmp_path / "policy", "numpy", with_value=True, stochastic=True)
+    seen, policy = observations(model), model.policy
+    action, value, mean, std = Policy(tmp_path / "policy.npz")(seen)
+    expected = np.asarray(policy.vf.apply(policy.vf_state.params, seen))[:, 0]
+    np.testing.assert_allclose(value, expected, atol=1e-5)
+    gaussian = policy.actor.apply(policy.actor_state.params, seen)
+    np.testing.assert_allclose(mean, gaussian.mean(), atol=1e-5)
+    np.testing.assert_allclose(std, np.broadcast_to(gaussian.stddev(), mean.shape), atol=1e-5)
+
+
 def test_values_of_a_dense_zip_are_those_of_sbx(trained, tmp_path):
     export_policy(trained["ppo"], tmp_path / "ppo", "dense")
     stock, model = PPO.load(tmp_path / "ppo.zip"), trained["ppo"]
