@@ -3,37 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Protocol
 from weakref import ref
 
 import torch as th
 from torch import nn
 
 from sb3_sparse.engine.internals import watching
+from sb3_sparse.engine.layer import SparseLayer
+from sb3_sparse.engine.passes import as_float32
 from sb3_sparse.engine.products import ChainPass, Products
-from sb3_sparse.engine.structure import Structure
-from sb3_sparse.errors import UnsupportedError
 
 PLAIN = (th.Tensor, th.nn.Parameter)
-
-
-class Link(Protocol):
-    """The view of a sparse layer that a chain has."""
-
-    bias: Any
-
-    def live(self) -> tuple[Structure, th.Tensor]:
-        """Return the connections to compute with now, and their values."""
-
-    def held(self) -> tuple[Structure, th.Tensor]:
-        """As :meth:`live`, without a graph and while another thread may move connections."""
-
-
-class LinearLink(Link, Protocol):
-    """The view of a linear layer that a chain has."""
-
-    in_features: int
-    out_features: int
 
 
 class Chain:
@@ -45,12 +25,12 @@ class Chain:
     """
 
     def __init__(
-        self, layers: Sequence[LinearLink], activations: Sequence[nn.Module | None]
+        self, layers: Sequence[SparseLayer], activations: Sequence[nn.Module | None]
     ) -> None:
         self.layers = list(layers)
         self.activations = list(activations)
-        self.columns = self.layers[0].in_features
-        self.rows = self.layers[-1].out_features
+        self.columns = self.layers[0].structure.shape[1]
+        self.rows = self.layers[-1].structure.shape[0]
         # A graph must not hold the layers: Python's garbage collector cannot see through it, and
         # SB3's action distributions keep the last one.
         self._references = [ref(layer) for layer in self.layers]
@@ -65,14 +45,7 @@ class Chain:
 
         :raises UnsupportedError: unless it is float32 on the CPU and ``columns`` wide
         """
-        if x.is_floating_point() and th.is_autocast_enabled("cpu"):
-            x = x.float()  # autocast may have changed the result of an earlier layer
-        if x.dtype != th.float32 or x.device.type != "cpu" or x.shape[-1:] != (self.columns,):
-            raise UnsupportedError(
-                f"a layer in sparse storage takes float32 on the CPU with "
-                f"{self.columns} features, got {x.dtype} on {x.device} of shape {tuple(x.shape)}; "
-                "use compute='masked' for anything else"
-            )
+        x = as_float32(x, self.columns)
         lead = x.shape[:-1]
         x = x.reshape(-1, self.columns).contiguous().resolve_neg()
         return x, x.shape[0], lead

@@ -21,13 +21,11 @@ from sb3_sparse.engine.native.library import (
     ImageStepArgument,
     MapArgument,
     library,
-    readable,
-)  # fmt: skip
+)
+from sb3_sparse.engine.passes import Gradients, check_values, empty
 from sb3_sparse.engine.reused import ReusedMemory
 from sb3_sparse.engine.structure import Structure
-from sb3_sparse.errors import UnsupportedError
 
-_empty = partial(th.empty, dtype=th.float32, device="cpu")
 FEW = 4
 """Up to so many images are computed one by one where no backward pass follows."""
 
@@ -100,7 +98,7 @@ class ImagePass(NamedTuple):
     def forward(self, x: th.Tensor, parameters: Sequence[Any]) -> tuple[th.Tensor, th.Tensor, Any]:
         """Compute the result, all that the backward pass reads, and nothing else."""
         layout = self.call.layout
-        y = _empty(self.batch, *layout.maps[self.steps[-1].output].shape)
+        y = empty(self.batch, *layout.maps[self.steps[-1].output].shape)
         kept = self.memory(-(-self.batch // LANES) * layout.kept_size)
         images = self._images(layout.forward_size, kept, images_in=x.data_ptr())
         images.images_out = y.data_ptr()
@@ -117,40 +115,23 @@ class ImagePass(NamedTuple):
         grad: th.Tensor,
         _: Any,
     ) -> list[th.Tensor | None]:
-        """Compute the gradients of the input and of each parameter; None where not needed.
+        """Compute the gradients as a :class:`~sb3_sparse.engine.passes.Pass` does.
 
         :param kept: the maps that :meth:`forward` kept
-        :param needs: whether the gradient of the input and of each parameter is needed
-        :param grad: gradient of the result
         """
         needs_x, *needed = needs
-        grads = [
-            th.empty_like(parameter) if need and parameter is not None else None
-            for parameter, need in zip(parameters, needed, strict=True)
-        ]
         arguments = self._arguments(parameters)
-        listening: list[tuple[ImageStep, Any, th.Tensor]] = []
-        convolutions = [i for i, step in enumerate(self.steps) if step.weight is not None]
-        for n, i in enumerate(convolutions):
-            step, argument = self.steps[i], arguments[i]
-            value_grad, bias_grad = grads[2 * n : 2 * n + 2]
-            if bias_grad is not None:
-                argument.bias_grad = bias_grad.data_ptr()
-            if value_grad is None:
-                continue
-            argument.value_grad = value_grad.data_ptr()
-            listener = None if (module := self.layers[n]()) is None else module.listener
-            if listener is not None and listener.wanted():
-                output_grad = _empty(self.batch, *self.call.layout.maps[step.output].shape)
-                argument.output_grad = output_grad.data_ptr()
-                listening.append((step, listener, output_grad))
+        numbers = [i for i, step in enumerate(self.steps) if step.weight is not None]
+        steps = [self.steps[i] for i in numbers]
+        shapes = [(self.batch, *self.call.layout.maps[step.output].shape) for step in steps]
+        grads = Gradients(parameters, needed, self.layers, [arguments[i] for i in numbers], shapes)
         grad_x = th.empty_like(x) if needs_x else None
         images = self._images(self.call.layout.backward_size, kept, images_out_grad=grad.data_ptr())
         images.images_in_grad = 0 if grad_x is None else grad_x.data_ptr()
         self._run("backward", images, arguments)
-        for step, listener, output_grad in listening:
-            listener.note(partial(self._outer, kept, step, output_grad))
-        return [grad_x, *grads]
+        for i, listener, output_grad in grads.listening:
+            listener.note(partial(self._outer, kept, steps[i], output_grad))
+        return [grad_x, *grads.all]
 
     def by_dense_weights(self, x: th.Tensor, parameters: Sequence[Any]) -> th.Tensor:
         """Compute the same result by dense weights, which torch can differentiate repeatedly."""
@@ -186,15 +167,7 @@ class ImagePass(NamedTuple):
             if isinstance(step.activation, ADJUSTABLE):
                 argument.activation, argument.a, argument.b = number_of(step.activation)
             structure, values, bias = next(convolutions)
-            for parameter in (values, bias):
-                if parameter is not None and not readable(parameter):
-                    raise UnsupportedError(
-                        "weights and biases of layers in sparse storage must be contiguous float32 "
-                        f"on the CPU, got {parameter.dtype} on {parameter.device} with strides "
-                        f"{parameter.stride()}"
-                    )
-            if values.numel() != structure.nnz:
-                raise RuntimeError("a layer's connections have changed while it was computing")
+            check_values(structure, values, bias)
             argument.row_start, argument.column, *by_columns = structure.addresses
             argument.column_start, argument.row, argument.position = by_columns
             argument.value = values.data_ptr()

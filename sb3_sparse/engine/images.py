@@ -9,13 +9,14 @@ from weakref import ref
 
 import torch as th
 
-from sb3_sparse.engine.chains import Link, watched
+from sb3_sparse.engine.chains import watched
 from sb3_sparse.engine.image_layout import LANES, ImageStep
 from sb3_sparse.engine.image_pass import FEW, ImagePass, by_dense_weights, prepare
+from sb3_sparse.engine.layer import SparseLayer
+from sb3_sparse.engine.passes import as_float32
 from sb3_sparse.engine.products import Products
 from sb3_sparse.engine.reused import ReusedMemory
 from sb3_sparse.engine.structure import Structure
-from sb3_sparse.errors import UnsupportedError
 
 SIZES = 16
 """Of images, for which a chain stays prepared."""
@@ -39,7 +40,7 @@ class ImageChain:
     :param layers: their convolutions
     """
 
-    def __init__(self, steps: Sequence[ImageStep], layers: Sequence[Link]) -> None:
+    def __init__(self, steps: Sequence[ImageStep], layers: Sequence[SparseLayer]) -> None:
         self.steps = list(steps)
         self.activations = [step.activation for step in steps]
         self._layers = list(layers)
@@ -56,13 +57,7 @@ class ImageChain:
         """
         if x.dim() == 3:
             return self(x[None])[0]
-        if x.is_floating_point() and th.is_autocast_enabled("cpu"):
-            x = x.float()  # autocast may have changed the result of an earlier layer
-        if x.dtype != th.float32 or x.device.type != "cpu":
-            raise UnsupportedError(
-                f"a layer in sparse storage takes float32 on the CPU, got {x.dtype} on {x.device}; "
-                "use compute='masked' for anything else"
-            )
+        x = as_float32(x)
         structures: list[Structure] = []
         parameters: list[Any] = []
         seen = watched(x)

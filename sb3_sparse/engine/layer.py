@@ -56,6 +56,7 @@ class SparseLayer(nn.Module):
     dense_class: ClassVar[Any]
     """The class of torch that computes the same on a dense weight."""
     weight: nn.Parameter
+    bias: Any
     structure: Structure
     snapshot: Snapshot | None
     """What a hard target computes with if the mask has moved since its last copy; else None."""

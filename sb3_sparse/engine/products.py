@@ -18,19 +18,16 @@ from torch.nn import functional
 from sb3_sparse.engine.activations import number_of
 from sb3_sparse.engine.internals import is_batched
 from sb3_sparse.engine.layer import dense_weight
-from sb3_sparse.engine.native.library import BatchArgument, LayerArgument, library, readable
+from sb3_sparse.engine.native.library import BatchArgument, LayerArgument, library
+from sb3_sparse.engine.passes import Gradients, Pass, check_values, empty
 from sb3_sparse.engine.structure import Structure
-from sb3_sparse.errors import UnsupportedError
 
 TILE = 64
-
-# The kernels read and write float32 on the CPU, whatever torch's defaults are.
-_empty = partial(th.empty, dtype=th.float32, device="cpu")
 
 
 def _tiles(batch: int, features: int) -> th.Tensor:
     """Memory for a batch in tiles; the unused end of the last tile is 0, in case it is read."""
-    tiles = _empty(tiles_of(batch), features, TILE)
+    tiles = empty(tiles_of(batch), features, TILE)
     if batch % TILE:
         tiles[-1].zero_()
     return tiles
@@ -83,15 +80,7 @@ class ChainPass(NamedTuple):
             self.structures, self.activations, parameters[::2], parameters[1::2], outputs,
             strict=True,
         ):  # fmt: skip
-            for parameter in (values, bias):
-                if parameter is not None and not readable(parameter):
-                    raise UnsupportedError(
-                        "weights and biases of layers in sparse storage must be contiguous float32 "
-                        f"on the CPU, got {parameter.dtype} on {parameter.device} with strides "
-                        f"{parameter.stride()}"
-                    )
-            if values.numel() != structure.nnz:
-                raise RuntimeError("a layer's connections have changed while it was computing")
+            check_values(structure, values, bias)
             bias_at = 0 if bias is None else bias.data_ptr()
             arguments.append(
                 LayerArgument(
@@ -105,8 +94,8 @@ class ChainPass(NamedTuple):
         """The result, all other activations in tiles, and the array of ``layer_t``."""
         tiles = tiles_of(self.batch)
         widths = self._widths()
-        y = _tiles(self.batch, self.rows) if self.tiled_out else _empty(self.batch, self.rows)
-        work = _empty(tiles * TILE * sum(widths))
+        y = _tiles(self.batch, self.rows) if self.tiled_out else empty(self.batch, self.rows)
+        work = empty(tiles * TILE * sum(widths))
         start = at = work.data_ptr()
         places = []
         for width in widths:
@@ -136,32 +125,15 @@ class ChainPass(NamedTuple):
         grad: th.Tensor,
         arguments: Any,
     ) -> list[th.Tensor | None]:
-        """Compute the gradients of the input and of each parameter; None where not needed.
+        """Compute the gradients as a :class:`~sb3_sparse.engine.passes.Pass` does.
 
         :param work: activations as :meth:`forward` left them
-        :param needs: whether the gradient of the input and of each parameter is needed
-        :param grad: gradient of the result
         :param arguments: the array of ``layer_t`` that :meth:`forward` made
         """
         arguments = type(arguments).from_buffer_copy(arguments)
         needs_x, *needed = needs
-        grads = [
-            th.empty_like(parameter) if need and parameter is not None else None
-            for parameter, need in zip(parameters, needed, strict=True)
-        ]
-        listening: list[tuple[int, Any, th.Tensor]] = []
-        for i, (layer, argument) in enumerate(zip(self.layers, arguments, strict=True)):
-            values_grad, bias_grad = grads[2 * i : 2 * i + 2]
-            if bias_grad is not None:
-                argument.bias_grad = bias_grad.data_ptr()
-            if values_grad is None:
-                continue
-            argument.value_grad = values_grad.data_ptr()
-            listener = None if (module := layer()) is None else module.listener
-            if listener is not None and listener.wanted():
-                output_grad = _empty(tiles_of(self.batch), argument.rows, TILE)
-                argument.output_grad = output_grad.data_ptr()
-                listening.append((i, listener, output_grad))
+        shapes = [(tiles_of(self.batch), argument.rows, TILE) for argument in arguments]
+        grads = Gradients(parameters, needed, self.layers, arguments, shapes)
         grad_x = None
         if needs_x:
             grad_x = _tiles(self.batch, self.columns) if self.tiled_in else th.empty_like(x)
@@ -178,10 +150,10 @@ class ChainPass(NamedTuple):
         )
         if library().sb3_sparse_backward(arguments, ctypes.byref(batch)):
             raise MemoryError("no memory for the gradient of a chain of sparse layers")
-        inputs = self._inputs(x, work) if listening else []
-        for i, listener, output_grad in listening:
+        inputs = self._inputs(x, work) if grads.listening else []
+        for i, listener, output_grad in grads.listening:
             listener.note(partial(_outer, output_grad, inputs[i], self.batch))
-        return [grad_x, *grads]
+        return [grad_x, *grads.all]
 
     def _widths(self) -> list[int]:
         """Features of each array in the workspace: input and outputs without those in tiles."""
@@ -215,7 +187,7 @@ class Products(th.autograd.Function):
     """Applies a chain to a batch, differentiable by its input, values and biases."""
 
     @staticmethod
-    def forward(ctx: Any, how: ChainPass, x: th.Tensor, *parameters: Any) -> th.Tensor:
+    def forward(ctx: Any, how: Pass, x: th.Tensor, *parameters: Any) -> th.Tensor:
         y, work, arguments = how.forward(x, parameters)
         ctx.how, ctx.arguments = how, arguments
         # Where the backward pass does not read the result, an activation that works in place may
@@ -226,7 +198,7 @@ class Products(th.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *gradients: Any) -> Any:
-        how: ChainPass = ctx.how
+        how: Pass = ctx.how
         x, work, _, *parameters = ctx.saved_tensors
         needs = ctx.needs_input_grad[1:]
         # TRPO needs a differentiable gradient, and torch.func several at once.
