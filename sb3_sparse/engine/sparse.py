@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from functools import partial
-from typing import Any
 
 import numpy as np
 import torch as th
@@ -12,10 +10,11 @@ from numpy.typing import NDArray
 from torch import nn
 
 from sb3_sparse.engine.convolution import SparseConv2d
-from sb3_sparse.engine.gradients import DenseGradient, GradientMask, weakly
+from sb3_sparse.engine.gradients import GradientMask
 from sb3_sparse.engine.linear import SparseLinear
 from sb3_sparse.engine.masked import MaskedStorage
 from sb3_sparse.engine.moments import moments_of
+from sb3_sparse.engine.sparse_gradients import SparseStorageGradient
 from sb3_sparse.engine.storage import LayerStorage
 from sb3_sparse.engine.structure import Structure
 from sb3_sparse.errors import UnsupportedError
@@ -196,62 +195,6 @@ class SparseStorage(LayerStorage):
         self.moments_stale = True
         if any(target.structure is not structure for target in self.targets):
             self.mask_targets()
-
-
-class SparseStorageGradient(GradientMask):
-    """Takes a sparse layer's dense gradient from the kernels' backward pass.
-
-    :param layer: the layer
-    :param functional: whether the algorithm uses ``torch.autograd.grad``; if so, the first gradient
-        counts, otherwise the last
-    :param capturing: tells whether the next step needs the dense gradient
-    """
-
-    def __init__(
-        self, layer: SparseStorage, functional: bool, capturing: Callable[[], bool]
-    ) -> None:
-        super().__init__(capturing)
-        self.layer = layer
-        self.functional = functional
-        self._arriving: list[DenseGradient] = []
-
-    def attach(self) -> Any:
-        self.layer.module.listener = self
-        weight: Any = self.layer.weight
-        return weight.register_post_accumulate_grad_hook(weakly(self._arrived))
-
-    def wanted(self) -> bool:
-        """Whether the next step needs the dense gradient, and it is not there yet."""
-        return self.capturing() and not (self.functional and self.dense_grad is not None)
-
-    def note(self, dense_grad: DenseGradient) -> None:
-        """Keep a dense gradient; those of one backward pass add up."""
-        if self.functional:
-            self.dense_grad = dense_grad
-        else:
-            self._arriving.append(dense_grad)
-
-    def _arrived(self, weight: th.Tensor) -> None:
-        if self._arriving:
-            assert weight.grad is not None
-            # The gradient may include that of an earlier backward pass.
-            active, flat = weight.grad.clone(), self.layer.module.structure.flat
-            self.dense_grad = partial(_added_up, self._arriving, active, th.from_numpy(flat))
-            self._arriving = []
-
-    def take(self) -> DenseGradient | None:
-        dense_grad, stepping = self.dense_grad, self.layer.weight.grad is not None
-        if stepping or not self.functional:  # else keep that of the rollout
-            self.dense_grad = None
-        return dense_grad if stepping or self.functional else None
-
-
-def _added_up(parts: list[DenseGradient], active: th.Tensor, flat: th.Tensor) -> th.Tensor:
-    total = parts[0]()
-    for part in parts[1:]:
-        total += part()
-    total.view(-1)[flat] = active
-    return total
 
 
 def _carried(after: Structure, before: Structure) -> Callable[[th.Tensor], th.Tensor]:
