@@ -194,6 +194,16 @@ def impala() -> list[nn.Module]:
     ]
 
 
+def gradients(network: nn.Module) -> list[th.Tensor]:
+    """Copies of the gradients of all parameters."""
+    return [parameter.grad.clone() for parameter in network.parameters()]
+
+
+def inner(network: nn.Sequential) -> nn.Sequential:
+    """The modules of the first residual block of a network of :func:`impala`."""
+    return next(network[2].children())
+
+
 @contextmanager
 def using(instructions: str) -> Iterator[None]:
     """Compute with an instruction set for a while."""

@@ -110,13 +110,7 @@ def watched_layer(functional: bool) -> SimpleNamespace:
     return SimpleNamespace(dense=both.dense, sparse=module, layer=layer)
 
 
-@pytest.fixture(params=["kernels", "dense weights"])
-def few_images(request, monkeypatch):
-    """What computes a batch of few images."""
-    monkeypatch.setattr("sb3_sparse.engine.images.pays", lambda *_: request.param == "kernels")
-
-
-def test_the_dense_gradient_reaches_inactive_connections_and_adds_up_over_passes(few_images):
+def test_the_dense_gradient_reaches_inactive_connections_and_adds_up_over_passes(ways):
     both = watched_layer(functional=False)
     inputs = th.randn(2, 2, 3, 5, 5)
     for layer in (both.sparse, both.dense):
@@ -126,7 +120,7 @@ def test_the_dense_gradient_reaches_inactive_connections_and_adds_up_over_passes
     assert (found.reshape(-1)[~both.layer.mask()] != 0).all()
 
 
-def test_of_functional_gradients_the_first_without_a_graph_counts(few_images):
+def test_of_functional_gradients_the_first_without_a_graph_counts(ways):
     both = watched_layer(functional=True)
     x = th.randn(2, 3, 5, 5)
     for power, graph in ((2, True), (3, False), (4, False)):

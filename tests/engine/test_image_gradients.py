@@ -56,12 +56,6 @@ class Watched:
         assert any(grad.any() for grad in inactive)
 
 
-@pytest.fixture(params=["kernels", "dense weights"])
-def ways(request, monkeypatch):
-    """What computes a batch of few images."""
-    monkeypatch.setattr("sb3_sparse.engine.images.pays", lambda *_: request.param == "kernels")
-
-
 # Modules, shape of an image, and the steps of each chain.
 NETWORKS = {
     "impala": (impala, (2, 7, 9), [7]),

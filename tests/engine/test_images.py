@@ -10,10 +10,13 @@ from hypothesis import strategies as st
 from image_modules import EXACT, SMOOTH, drawn
 from image_support import (
     KINDS,
+    active,
     chains,
     close,
     compare,
     convolution,
+    convolutions,
+    gradients,
     impala,
     margin,
     twins,
@@ -69,10 +72,25 @@ def test_every_instruction_set_handles_every_batch(instructions, batch):
     assert chains(sparse) == [7]
 
 
+@pytest.mark.parametrize("batch", [1, 5, 15])
+def test_kernels_and_dense_weights_compute_few_images(ways, batch):
+    dense, sparse = twins(*impala())
+    x = th.randn(batch, 2, 7, 9, generator=th.Generator().manual_seed(4))
+    compare(dense, sparse, x)
+    assert chains(sparse) == [7]
+
+
 def test_instruction_sets_agree():
-    _, sparse = twins(*impala()[:-1], whole=True)
+    dense, sparse = twins(*impala()[:-1], whole=True)
     x = whole(20, 2, 7, 9)
-    found = []
+    y = dense(x)
+    y.backward(whole(*y.shape))
+    grads = (
+        grad
+        for layer in convolutions(dense)
+        for grad in (active(layer, layer.weight.grad), layer.bias.grad)
+    )
+    found = [[y.detach(), y[:1].detach(), *grads]]
     for name in library.instruction_sets():
         with using(name):
             sparse.zero_grad()
@@ -80,10 +98,10 @@ def test_instruction_sets_agree():
             y.backward(whole(*y.shape))
             with th.no_grad():
                 acted = sparse(x[:1])
-            found.append([y.detach(), acted, *(p.grad.clone() for p in sparse.parameters())])
-    for other in found[1:]:
-        for ours, first in zip(other, found[0], strict=True):
-            np.testing.assert_array_equal(ours, first)
+            found.append([y.detach(), acted, *gradients(sparse)])
+    for ours in found[1:]:
+        for one, expected in zip(ours, found[0], strict=True):
+            np.testing.assert_array_equal(one, expected)
 
 
 @pytest.mark.parametrize("batch", [1, 4, 40])
@@ -177,7 +195,9 @@ def test_lanes_without_an_image_must_not_cost_more_than_zeros(batch, nnz, expect
 
 
 def test_few_images_and_many_connections_take_dense_weights(monkeypatch):
-    monkeypatch.setattr("sb3_sparse.engine.images.pays", pays)
+    monkeypatch.setattr(
+        "sb3_sparse.engine.images.pays", pays
+    )  # the rule itself, which conftest.py turns off
     monkeypatch.setattr(ImagePass, "backward", None)  # which is not called
     dense, sparse = twins(convolution(), nn.ReLU(), convolution(), kind="full")
     compare(dense, sparse, th.randn(5, 2, 6, 5))
