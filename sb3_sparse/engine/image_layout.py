@@ -45,9 +45,9 @@ class Window(NamedTuple):
 
 
 class ImageStep(NamedTuple):
-    """One step: ``activation(convolution(input)) + add``, or the largest of each window.
+    """One step: ``activation(convolution(input))``, ``convolution(input) + add`` or a pooling.
 
-    It holds no layer, so that a graph may hold it.
+    A step that adds has no activation. It holds no layer, so that a graph may hold it.
 
     :param window: of the convolution or pooling
     :param weight: shape of the convolution's dense weight; None: it is a pooling
@@ -125,6 +125,7 @@ def lay_out(steps: Sequence[ImageStep], shape: Shape, keep: bool) -> Layout | No
 
     :param keep: whether a backward pass may follow
     """
+    assert all(step.activation is None or step.add is None for step in steps)
     shapes = _shapes(steps, shape)
     if shapes is None:
         return None

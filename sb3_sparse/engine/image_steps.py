@@ -145,10 +145,9 @@ def _steps(tokens: Sequence[Token]) -> list[ImageStep] | None:
                 or now != source
                 or last.activation
                 or last.add is not None
+                or last.weight is None
             ):
-                return None
-            if last.weight is None:
-                return None
+                return None  # the kernels add to what a convolution has just made
             steps[-1] = last._replace(add=add)
         elif isinstance(token, SparseConv2d | nn.MaxPool2d):
             if now != source and not isinstance(token, SparseConv2d):
@@ -158,7 +157,7 @@ def _steps(tokens: Sequence[Token]) -> list[ImageStep] | None:
             steps.append(ImageStep(Window.of(token), weight, None, now, source, maps))
             now = source = maps
         elif last is None or now != source or last.output != now:
-            return None
+            return None  # an activation needs a step whose result it takes
         elif (
             last.weight is not None
             and last.activation is None

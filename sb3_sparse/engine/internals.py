@@ -36,8 +36,9 @@ WRAPPED = "_orig_mod"
 """Where ``torch.compile`` keeps the module that it has wrapped."""
 
 any_global_hook: Any = _has_any_global_hook
-pytree: Any = _pytree
 """Whether a hook is registered for all modules."""
+pytree: Any = _pytree
+"""Nested containers of tensors as flat lists."""
 module_hooks: Any = itemgetter(*MODULE_HOOKS)
 """The hooks on the calls of a module, given its ``vars``."""
 

@@ -91,7 +91,8 @@ def _sparse(
     :param kwargs: the policy's arguments
     """
     names = {layer.name for layer in outline.layers}
-    if compute == "sparse":  # as far as shapes tell: not of groups and dilation
+    if compute == "sparse":
+        # Shapes do not tell groups and dilation, so a grouped convolution counts as sparse here.
         return {layer.name for layer in outline.layers if storable(layer.module)}
     if compute != "auto" or not _known(policy_class):
         return set()

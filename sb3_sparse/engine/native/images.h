@@ -20,7 +20,7 @@ typedef struct {
     int64_t grad_at; /* place of its gradient in the memory of a thread; -1: it has none */
 } map_t;
 
-/* One step: out = f(W in + b) + add, or out = the largest of each window; copy = max(out, 0). */
+/* One step: out = f(W in + b), or W in + b + add, or the largest of each window; copy = max(out, 0). */
 typedef struct {
     int64_t kind;
     int64_t in;     /* numbers of maps, as all up to `gate`; -1: there is none */
