@@ -175,7 +175,8 @@ class _Writer:
 
     def _linear(self, layer: Linear, x: str, y: str) -> None:
         rows, scales = self._rows(layer)
-        bits = self._bits(layer.weight.shape[1])
+        longest = int(np.count_nonzero(rows, axis=1).max())
+        bits = self._bits(max(longest, rows.shape[1] - 1))
         if rows.size * self._width <= np.count_nonzero(rows) * (self._width + bits // 8):
             name, source_bits = "linear_dense" + "_int8" * self.int8, None
             tables = [str(rows.shape[1]), self._table("value", side_by_side(rows), self._type)]
@@ -251,8 +252,12 @@ class _Writer:
         return BYTES[self._type]
 
     @staticmethod
-    def _bits(count: int) -> int:
-        return 16 if count < 2**16 else 32  # a length may be the count
+    def _bits(most: int) -> int:
+        """Return the bits of indices and lengths.
+
+        :param most: the largest of them
+        """
+        return next(bits for bits in ckernels.INDEX_TYPES if most < 2**bits)
 
     def _place(self, value: int) -> str:
         if value == 0:

@@ -6,7 +6,7 @@ from string import Template
 
 GROUP = 8
 """Rows of a linear layer that are computed side by side."""
-INDEX_TYPES = {16: "uint16_t", 32: "uint32_t"}
+INDEX_TYPES = {8: "uint8_t", 16: "uint16_t", 32: "uint32_t"}
 _LANES = range(GROUP)
 
 _LINEAR = Template("""\

@@ -106,6 +106,23 @@ def test_indices_have_16_bits_where_they_fit_and_32_where_not():
     assert "uint32_t column_1" not in narrow
 
 
+@pytest.mark.parametrize(
+    ("columns", "longest", "index"),
+    [(256, 2, "uint8_t"), (256, 255, "uint8_t"), (256, 256, "uint16_t"), (257, 2, "uint16_t")],
+)
+def test_indices_have_8_bits_where_columns_and_lengths_fit(columns, longest, index):
+    weight = np.zeros((9, columns), np.float32)
+    weight[:8, -2:] = 1, 2
+    weight[8, -longest:] = 3
+    graph = chain(columns, (weight, np.arange(9.0)))
+    source = write_c(graph, "0").source
+    assert f"{index} length_1[2]" in source
+    assert f"{index} column_1[{16 + longest}]" in source
+    observations = np.random.default_rng(0).normal(size=(3, columns)).astype(np.float32)
+    expected = observations @ weight.T + np.arange(9)
+    np.testing.assert_allclose(compiled(source, graph)(observations), expected, atol=1e-3)
+
+
 def test_a_layer_that_is_nearly_dense_has_no_indices():
     source = write_c(chain(3, (np.ones((9, 3)), np.zeros(9))), "0").source
     assert "column_1" not in source
