@@ -138,7 +138,8 @@ def measure(folder: Path, board: str, options: str, expected: np.ndarray, within
 
 def cases(sizes: list[int], sparsities: list[int], emlearn: Path | None, folder: Path):
     """Write the policies of one size; yield what each is, its folder, options, and actions."""
-    rows = np.random.default_rng(0).normal(size=(OBSERVATIONS, sizes[0])).astype(np.float32)
+    seen = np.random.default_rng(0).normal(size=(1000, sizes[0])).astype(np.float32)
+    rows = seen[:OBSERVATIONS]
 
     def made(name: str) -> Path:
         (folder / name).mkdir()
@@ -159,9 +160,10 @@ def cases(sizes: list[int], sparsities: list[int], emlearn: Path | None, folder:
     for percent in sparsities:
         model = actor(sizes, percent / 100)
         actions, _ = model.predict(rows, deterministic=True)
-        for name, int8 in (("float", False), ("int8", True)):
-            where = made(f"{name}{percent}")
-            export_policy(model, where / "policy", "c", int8=int8)
+        for name, int8 in (("float", False), ("int8", "weights"), ("int8 full", "full")):
+            where = made(f"{name.replace(' ', '_')}{percent}")
+            recorded = seen if int8 == "full" else None
+            export_policy(model, where / "policy", "c", int8=int8, observations=recorded)
             yield percent, name, where, "-O2", actions, 0.1 if int8 else 1e-5
 
 

@@ -26,7 +26,8 @@ def test_sparse_policies_take_fewer_instructions_and_bytes(tmp_path, monkeypatch
     monkeypatch.setattr(sys, "argv", ["microcontroller.py", *words])
     microcontroller.main()
     rows = list(csv.DictReader(out.open()))
-    variants = [("dense loop", ""), ("float", "0"), ("int8", "0"), ("float", "90"), ("int8", "90")]
+    kinds = ("float", "int8", "int8 full")
+    variants = [("dense loop", ""), *((kind, percent) for percent in ("0", "90") for kind in kinds)]
     for board in ("m4f", "m0"):
         here = {(row["variant"], row["sparsity"]): row for row in rows if row["board"] == board}
         assert list(here) == variants
@@ -38,3 +39,7 @@ def test_sparse_policies_take_fewer_instructions_and_bytes(tmp_path, monkeypatch
         assert float(sparse["fewer"]) > 3
         assert float(sparse["smaller"]) > 3
         assert int(here["int8", "0"]["flash"]) < int(here["float", "0"]["flash"]) / 2
+        whole, floats = here["int8 full", "0"], here["float", "0"]
+        assert int(whole["ram"]) < int(floats["ram"])
+        if board == "m0":  # which has no float unit
+            assert int(whole["instructions"]) < int(floats["instructions"]) / 4
