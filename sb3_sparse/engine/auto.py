@@ -10,13 +10,13 @@ together are sparse enough (docs/compute.md has the measurements).
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 
 import torch as th
 from torch import nn
 
 from sb3_sparse.engine.convolution import SparseConv2d
-from sb3_sparse.engine.image_steps import in_order, is_between
+from sb3_sparse.engine.image_modules import in_order, is_between
 from sb3_sparse.engine.native.library import in_use, why_missing
 from sb3_sparse.engine.optimizers import acts_elementwise
 from sb3_sparse.engine.paths import is_sequence
@@ -116,23 +116,8 @@ def sparse_enough(size: int, nnz: int) -> bool:
 def chains_of(root: nn.Module, layers: Iterable[LayerStorage]) -> list[list[LayerStorage]]:
     """Group linear layers that follow each other with nothing but activations between them."""
     linear = {id(layer.module): layer for layer in layers if isinstance(layer.module, nn.Linear)}
-    chains: list[list[LayerStorage]] = []
-    seen: set[int] = set()
-    for sequence in root.modules():
-        if not isinstance(sequence, nn.Sequential):
-            continue
-        chain: list[LayerStorage] = []
-        for module in sequence:
-            layer = linear.get(id(module))
-            if layer is not None and id(module) not in seen:
-                seen.add(id(module))
-                chain.append(layer)
-            elif type(module) not in ELEMENTWISE and chain:
-                chains.append(chain)
-                chain = []
-        if chain:
-            chains.append(chain)
-    return chains + [[layer] for key, layer in linear.items() if key not in seen]
+    sequences = (module for module in root.modules() if isinstance(module, nn.Sequential))
+    return _grouped(linear, sequences, lambda module: type(module) in ELEMENTWISE)
 
 
 def image_chains_of(root: nn.Module, layers: Iterable[LayerStorage]) -> list[list[LayerStorage]]:
@@ -145,20 +130,31 @@ def image_chains_of(root: nn.Module, layers: Iterable[LayerStorage]) -> list[lis
         for layer in layers
         if SparseConv2d.takes(layer.module) or isinstance(layer.module, SparseConv2d)
     }
+    return _grouped(convolutions, map(in_order, filter(is_sequence, root.modules())), is_between)
+
+
+def _grouped(
+    layers: Mapping[int, LayerStorage],
+    sequences: Iterable[Iterable[nn.Module]],
+    is_between: Callable[[nn.Module], bool],
+) -> list[list[LayerStorage]]:
+    """Group layers that follow each other.
+
+    :param layers: by the id of their module
+    :param sequences: modules in the order in which they are called
+    :param is_between: whether a module may stand between two layers of a chain
+    """
     chains: list[list[LayerStorage]] = []
-    seen: set[int] = set()
-    for sequence in root.modules():
-        if not is_sequence(sequence):
-            continue
+    left = dict(layers)
+    for sequence in sequences:
         chain: list[LayerStorage] = []
-        for module in in_order(sequence):
-            layer = convolutions.get(id(module))
-            if layer is not None and id(module) not in seen:
-                seen.add(id(module))
+        for module in sequence:
+            layer = left.pop(id(module), None)
+            if layer is not None:
                 chain.append(layer)
             elif not is_between(module) and chain:
                 chains.append(chain)
                 chain = []
         if chain:
             chains.append(chain)
-    return chains + [[layer] for key, layer in convolutions.items() if key not in seen]
+    return chains + [[layer] for layer in left.values()]

@@ -10,7 +10,7 @@ from torch import nn
 
 from sb3_sparse.engine.internals import watching
 from sb3_sparse.engine.layer import SparseLayer
-from sb3_sparse.engine.passes import as_float32
+from sb3_sparse.engine.passes import as_float32, needs_graph, read
 from sb3_sparse.engine.products import ChainPass, Products
 
 PLAIN = (th.Tensor, th.nn.Parameter)
@@ -52,19 +52,12 @@ class Chain:
 
     def run(self, x: th.Tensor, batch: int, tiled_in: bool, tiled_out: bool) -> th.Tensor:
         """Apply the layers to rows ``(batch, columns)`` or tiles; the result is rows or tiles."""
-        structures, parameters = [], []
         seen = watched(x)
-        acting = not seen and not th.is_grad_enabled()
-        for layer in self.layers:
-            structure, values = layer.held() if acting else layer.live()
-            structures.append(structure)
-            parameters += [values, layer.bias]
+        structures, parameters = read(self.layers, acting=not seen and not th.is_grad_enabled())
         how = ChainPass(self.activations, structures, self._references, batch, tiled_in, tiled_out)
         if seen:
             return how.by_dense_weights(x, parameters)
-        if th.is_grad_enabled() and (
-            x.requires_grad or any(p is not None and p.requires_grad for p in parameters)
-        ):
+        if needs_graph(x, parameters):
             y: th.Tensor = Products.apply(how, x, *parameters)  # type: ignore[no-untyped-call]
             return y
         return how.forward(x, parameters)[0]

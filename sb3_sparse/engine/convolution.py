@@ -10,7 +10,7 @@ from typing import Any
 import torch as th
 from torch import nn
 
-from sb3_sparse.engine.image_layout import ImageStep, Window
+from sb3_sparse.engine.image_step import ImageStep, Window
 from sb3_sparse.engine.images import ImageChain
 from sb3_sparse.engine.layer import SparseLayer
 from sb3_sparse.errors import UnsupportedError

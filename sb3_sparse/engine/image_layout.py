@@ -1,16 +1,13 @@
-"""The memory of passes of images through convolutions and poolings.
-
-A chain is a list of steps between numbered maps: map 0 is the input, and each step writes the next
-maps. A layout gives every map, and its gradient, a place in memory for images of one size.
-"""
+"""Where the maps of a chain, and their gradients, lie in memory, for images of one size."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from math import prod
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-from torch import nn
+from sb3_sparse.engine.image_backward import Backward, plan_backward
+from sb3_sparse.engine.image_step import ImageStep
 
 LANES = 16
 """Images to a tile; ``kernels.h`` has the same number."""
@@ -18,55 +15,6 @@ LIMIT = 2**31 - 1
 """The kernels find numbers within a map by 32-bit offsets."""
 Shape = tuple[int, int, int]
 """Channels, height and width."""
-
-
-def _pair(value: Any) -> tuple[int, int]:
-    if isinstance(value, Sequence):
-        return int(value[0]), int(value[-1])
-    return int(value), int(value)
-
-
-class Window(NamedTuple):
-    """Kernel, stride and padding of a convolution or pooling, each by height and width."""
-
-    kernel: tuple[int, int]
-    stride: tuple[int, int]
-    padding: tuple[int, int]
-
-    @classmethod
-    def of(cls, module: nn.Conv2d | nn.MaxPool2d) -> Window:
-        """Read the window of a module."""
-        return cls(_pair(module.kernel_size), _pair(module.stride), _pair(module.padding))
-
-    def result(self, height: int, width: int) -> tuple[int, int]:
-        """Compute the size of the result for an input of that size; below 1 there is none."""
-        (ky, kx), (sy, sx), (py, px) = self
-        return (height + 2 * py - ky) // sy + 1, (width + 2 * px - kx) // sx + 1
-
-
-class ImageStep(NamedTuple):
-    """One step: ``activation(convolution(input))``, ``convolution(input) + add`` or a pooling.
-
-    A step that adds has no activation. It holds no layer, so that a graph may hold it.
-
-    :param window: of the convolution or pooling
-    :param weight: shape of the convolution's dense weight; None: it is a pooling
-    :param activation: None: no activation
-    :param input: number of the map that is read
-    :param source: number of the map that the input is the positive part of, or the input itself
-    :param output: number of the map that is written
-    :param add: number of the map that is added; None: nothing is added
-    :param copy: number of the map that gets the positive part of the output; None: nobody reads it
-    """
-
-    window: Window
-    weight: tuple[int, ...] | None
-    activation: nn.Module | None
-    input: int
-    source: int
-    output: int
-    add: int | None = None
-    copy: int | None = None
 
 
 class Map(NamedTuple):
@@ -82,19 +30,6 @@ class Map(NamedTuple):
     kept: bool
     at: int
     grad_at: int | None
-
-
-class Backward(NamedTuple):
-    """What the backward pass of a step does besides its products.
-
-    :param gate: number of the map where the gradient of the source counts: where it is positive
-    :param adds: whether the gradient of the source has begun
-    :param slope: whether it begins with the slope of the step's activation
-    """
-
-    gate: int | None
-    adds: bool
-    slope: bool
 
 
 class Layout(NamedTuple):
@@ -129,7 +64,7 @@ def lay_out(steps: Sequence[ImageStep], shape: Shape, keep: bool) -> Layout | No
     shapes = _shapes(steps, shape)
     if shapes is None:
         return None
-    backward, kept, origin = _gradients(steps, len(shapes))
+    backward, kept, origin = plan_backward(steps, len(shapes))
     ring, grad_ring = _rings(steps, shapes)
     sizes = [_size(shape, ring) for shape in shapes]
     grad_sizes = [_size(shape, grad_ring) for shape in shapes]
@@ -208,43 +143,6 @@ def _rings(steps: Sequence[ImageStep], shapes: Sequence[Shape]) -> tuple[int, in
             behind = (size - 1 + padding) // stride - (result - 1)
             grad_ring = max(grad_ring, before, behind)
     return ring, grad_ring
-
-
-def _gradients(
-    steps: Sequence[ImageStep], count: int
-) -> tuple[list[Backward], set[int], list[int]]:
-    """Plan the backward pass.
-
-    :param count: number of maps
-    :return: what each step does, the maps that it reads, and for each map the one that it shares
-        its gradient with, which may be itself
-    """
-    producer = {step.output: step for step in steps}
-    begun: set[int] = set()
-    gated: set[int] = set()
-    kept: set[int] = set()
-    origin = list(range(count))
-    backward: list[Backward] = []
-    for step in reversed(steps):
-        slope = step.activation is not None and step.output not in gated
-        if slope:
-            kept.add(step.output)
-        if step.add is not None:
-            if step.source != step.add:  # else the kernels would read what they write
-                origin[step.add] = origin[step.output]
-            begun.add(step.add)
-        adds, gate = step.source in begun, None
-        if step.weight is not None:
-            kept.add(step.input)
-            before = producer.get(step.source)
-            if step.input != step.source:
-                gate = step.input
-            elif not adds and before is not None and type(before.activation) is nn.ReLU:
-                gate = step.input
-                gated.add(step.source)
-        begun.add(step.source)
-        backward.append(Backward(gate, adds, slope))
-    return backward[::-1], kept, origin
 
 
 def _lives(steps: Sequence[ImageStep], count: int) -> list[tuple[int, int]]:

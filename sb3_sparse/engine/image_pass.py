@@ -13,7 +13,8 @@ from torch.nn import functional
 from torch.nn.grad import conv2d_weight
 
 from sb3_sparse.engine.activations import ADJUSTABLE, number_of
-from sb3_sparse.engine.image_layout import LANES, ImageStep, Layout, Shape, lay_out
+from sb3_sparse.engine.image_layout import LANES, Layout, Shape, lay_out
+from sb3_sparse.engine.image_step import ImageStep
 from sb3_sparse.engine.internals import is_batched
 from sb3_sparse.engine.layer import dense_weight
 from sb3_sparse.engine.native.library import (
@@ -51,12 +52,12 @@ def prepare(steps: Sequence[ImageStep], shape: Shape, keep: bool) -> Call | None
     layout = lay_out(steps, shape, keep)
     if layout is None:
         return None
-    maps = [MapArgument(*m.shape, m.kept, m.at, _or_none(m.grad_at)) for m in layout.maps]
+    maps = [MapArgument(*m.shape, m.kept, m.at, _number(m.grad_at)) for m in layout.maps]
     arguments = [
         ImageStepArgument(
             step.weight is None,
-            step.input, step.source, step.output, _or_none(step.add), _or_none(step.copy),
-            _or_none(back.gate), back.adds, back.slope,
+            step.input, step.source, step.output, _number(step.add), _number(step.copy),
+            _number(back.gate), back.adds, back.slope,
             *chain.from_iterable(step.window), taken, *number_of(step.activation),
         )
         for step, taken, back in zip(steps, layout.taken, layout.backward, strict=True)
@@ -68,7 +69,7 @@ def prepare(steps: Sequence[ImageStep], shape: Shape, keep: bool) -> Call | None
     )
 
 
-def _or_none(number: int | None) -> int:
+def _number(number: int | None) -> int:
     return -1 if number is None else number
 
 

@@ -4,22 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache, partial
-from typing import Any
 from weakref import ref
 
 import torch as th
 
 from sb3_sparse.engine.chains import watched
-from sb3_sparse.engine.image_layout import LANES, ImageStep
+from sb3_sparse.engine.image_layout import LANES
 from sb3_sparse.engine.image_pass import FEW, ImagePass, by_dense_weights, prepare
+from sb3_sparse.engine.image_step import ImageStep
 from sb3_sparse.engine.layer import SparseLayer
-from sb3_sparse.engine.passes import as_float32
+from sb3_sparse.engine.passes import as_float32, needs_graph, read
 from sb3_sparse.engine.products import Products
 from sb3_sparse.engine.reused import ReusedMemory
 from sb3_sparse.engine.structure import Structure
 
 SIZES = 16
-"""Of images, for which a chain stays prepared."""
+"""For so many sizes of images a chain stays prepared."""
 
 
 def pays(batch: int, structures: Sequence[Structure]) -> bool:
@@ -58,17 +58,9 @@ class ImageChain:
         if x.dim() == 3:
             return self(x[None])[0]
         x = as_float32(x)
-        structures: list[Structure] = []
-        parameters: list[Any] = []
         seen = watched(x)
-        acting = not seen and not th.is_grad_enabled()
-        for layer in self._layers:
-            structure, values = layer.held() if acting else layer.live()
-            structures.append(structure)
-            parameters += [values, layer.bias]
-        trains = th.is_grad_enabled() and (
-            x.requires_grad or any(p is not None and p.requires_grad for p in parameters)
-        )
+        structures, parameters = read(self._layers, acting=not seen and not th.is_grad_enabled())
+        trains = needs_graph(x, parameters)
         if seen:  # a tracer's sizes are no numbers
             return by_dense_weights(self.steps, structures, x, parameters)
         call = self._call(tuple(x.shape[1:]), trains) if x.dim() == 4 else None

@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 import torch as th
 
-from sb3_sparse.engine.layer import Listener
+from sb3_sparse.engine.layer import Listener, SparseLayer
 from sb3_sparse.engine.native.library import readable
 from sb3_sparse.engine.structure import Structure
 from sb3_sparse.errors import UnsupportedError
@@ -79,6 +79,27 @@ def as_float32(x: th.Tensor, columns: int | None = None) -> th.Tensor:
             "use compute='masked' for anything else"
         )
     return x
+
+
+def read(layers: Iterable[SparseLayer], acting: bool) -> tuple[list[Structure], list[Any]]:
+    """Read what a pass computes with: the connections, and values and bias, of each layer in turn.
+
+    :param acting: whether another thread may move connections meanwhile, and no graph is needed
+    """
+    structures: list[Structure] = []
+    parameters: list[Any] = []
+    for layer in layers:
+        structure, values = layer.held() if acting else layer.live()
+        structures.append(structure)
+        parameters += [values, layer.bias]
+    return structures, parameters
+
+
+def needs_graph(x: th.Tensor, parameters: Iterable[th.Tensor | None]) -> bool:
+    """Whether torch wants the gradient of an input or of a parameter."""
+    return th.is_grad_enabled() and (
+        x.requires_grad or any(p is not None and p.requires_grad for p in parameters)
+    )
 
 
 def check_values(structure: Structure, values: th.Tensor, bias: th.Tensor | None) -> None:

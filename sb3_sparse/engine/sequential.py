@@ -10,7 +10,7 @@ from torch import nn
 
 from sb3_sparse.engine.activations import ACTIVATIONS, ADJUSTABLE, tells_its_slope
 from sb3_sparse.engine.chains import Chain, watched
-from sb3_sparse.engine.image_steps import ImageAttributes, has_convolution, plan
+from sb3_sparse.engine.image_modules import ImageAttributes, has_convolution, steps_of
 from sb3_sparse.engine.images import ImageChain
 from sb3_sparse.engine.inference import by_modules
 from sb3_sparse.engine.internals import MODULE_HOOKS, any_global_hook, become
@@ -116,7 +116,7 @@ def _steps(modules: Sequence[Any]) -> list[tuple[Any, bool, bool]]:
     while position < len(modules):
         module = modules[position]
         if has_convolution(module):
-            steps, layers, count = plan(modules[position:])
+            steps, layers, count = steps_of(modules[position:])
             if steps:
                 groups.append(ImageChain(steps, layers))
                 position += count

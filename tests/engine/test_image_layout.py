@@ -14,8 +14,9 @@ from image_modules import EXACT, Drawn, drawn
 from image_support import twins
 from torch import nn
 
-from sb3_sparse.engine.image_layout import LANES, ImageStep, Layout, Window, lay_out
-from sb3_sparse.engine.image_steps import plan
+from sb3_sparse.engine.image_layout import LANES, Layout, lay_out
+from sb3_sparse.engine.image_modules import steps_of
+from sb3_sparse.engine.image_step import ImageStep, Window
 
 ONE = Window((1, 1), (1, 1), (0, 0))
 SAME = Window((3, 3), (1, 1), (1, 1))
@@ -25,12 +26,12 @@ def convolution(outputs: int, inputs: int, window: Window, *maps: int, **rest) -
     return ImageStep(window, (outputs, inputs, *window.kernel), None, *maps, **rest)
 
 
-def steps_of(network: Drawn) -> Iterator[tuple[list[ImageStep], tuple[int, int, int]]]:
+def planned(network: Drawn) -> Iterator[tuple[list[ImageStep], tuple[int, int, int]]]:
     """The steps of each chain of a network, and the shape of its images."""
     _, sparse = twins(*network.modules)
     modules, x = list(sparse), th.zeros(1, *network.shape)
     while modules:
-        steps, _, count = plan(modules)
+        steps, _, count = steps_of(modules)
         if steps:
             yield steps, tuple(x.shape[1:])
         for module in modules[: max(count, 1)]:
@@ -66,7 +67,7 @@ def places(layout: Layout, numbers, ring: int) -> list[tuple[int, int]]:
 @settings(max_examples=100, deadline=None)
 @given(network=drawn(EXACT, pools=3), keep=st.booleans())
 def test_maps_of_the_forward_pass_lie_apart(network, keep):
-    for steps, shape in steps_of(network):
+    for steps, shape in planned(network):
         layout = lay_out(steps, shape, keep)
         loose = [number for number, m in enumerate(layout.maps) if not m.kept]
         kept = [number for number, m in enumerate(layout.maps) if m.kept]
@@ -93,7 +94,7 @@ def test_maps_of_the_forward_pass_lie_apart(network, keep):
 @settings(max_examples=100, deadline=None)
 @given(network=drawn(EXACT, pools=3))
 def test_the_backward_pass_keeps_what_it_reads(network):
-    for steps, shape in steps_of(network):
+    for steps, shape in planned(network):
         layout = lay_out(steps, shape, True)
         for step, back in zip(steps, layout.backward, strict=True):
             if step.weight is not None:
@@ -134,7 +135,7 @@ class Memory:
 @settings(max_examples=100, deadline=None)
 @given(network=drawn(EXACT, pools=3))
 def test_gradients_add_up_and_lie_apart_until_they_are_read(network):
-    for steps, shape in steps_of(network):
+    for steps, shape in planned(network):
         layout = lay_out(steps, shape, True)
         memory, last = Memory(layout), steps[-1].output
         memory.write(last, frozenset({"result"}))

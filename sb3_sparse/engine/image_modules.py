@@ -1,4 +1,4 @@
-"""Splits modules into the steps that the kernels compute on images."""
+"""Modules that the kernels compute on images, as steps of a chain."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from torch import nn
 
 from sb3_sparse.engine.activations import tells_its_slope
 from sb3_sparse.engine.convolution import SparseConv2d, convolution_attributes
-from sb3_sparse.engine.image_layout import ImageStep, Window
+from sb3_sparse.engine.image_step import ImageStep, Window
 from sb3_sparse.engine.paths import called_by, is_residual, is_sequence
 
 
 class _Enter(NamedTuple):
-    """Marks the begin of a residual block."""
+    """Marks where a residual block begins."""
 
 
 class _Leave(NamedTuple):
-    """Marks its end."""
+    """Marks where a residual block ends."""
 
 
 _ATTRIBUTES: dict[type[nn.Module], Callable[[Any], Any]] = {
@@ -62,8 +62,8 @@ def has_convolution(module: nn.Module) -> bool:
     return type(module) is SparseConv2d
 
 
-def plan(modules: Sequence[nn.Module]) -> tuple[list[ImageStep], list[SparseConv2d], int]:
-    """Plan the steps of as many modules as possible, from the first one on.
+def steps_of(modules: Sequence[nn.Module]) -> tuple[list[ImageStep], list[SparseConv2d], int]:
+    """Turn as many modules as possible into steps, from the first one on.
 
     :param modules: modules in the order in which they are called
     :return: the steps, their convolutions, and the number of modules that they stand for; none if
