@@ -46,10 +46,13 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--widths", type=listed(int))
     parser.add_argument("--images", action="store_true", help="images instead of vectors")
     parser.add_argument(
-        "--networks", type=listed(str), default=list(EXTRACTORS), help="of --images"
+        "--networks", type=listed(str), default=list(EXTRACTORS), help="of --images: nature,impala"
     )
     parser.add_argument(
-        "--distributions", type=listed(str), default=["erk", "uniform"], help="of --images"
+        "--distributions",
+        type=listed(str),
+        default=["erk", "uniform"],
+        help="of --images: erk,uniform",
     )
     parser.add_argument(
         "--convolutions", default="", help="of --images: only layers whose name contains this"

@@ -5,8 +5,9 @@
 #include <stdint.h>
 
 #include "board.h"
-#include "observations.h"
-#include "policy.h"
+
+#include <observations.h> /* of the folder IN, whatever lies beside this file */
+#include <policy.h>
 
 #define PAINT 0x5AFEC0DEu
 #define PAINTED 512 /* words of stack that are watched */

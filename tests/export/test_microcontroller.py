@@ -106,6 +106,32 @@ def test_a_board_acts_as_the_model_does(name, board, tmp_path):
 
 
 @needs_board
+def test_files_left_beside_the_program_do_not_count(tmp_path, monkeypatch):
+    example = shutil.copytree(EXAMPLE, tmp_path / "example")
+    for name in ("policy.h", "observations.h"):
+        (example / name).write_text("#error of another policy\n")
+    monkeypatch.setattr(sys.modules[__name__], "EXAMPLE", example)
+    model = MODELS["PPO"]()
+    (tmp_path / "own").mkdir()
+    export_policy(model, tmp_path / "own" / "policy", "c")
+    observations = random_observations(model.observation_space, None, 3)
+    assert len(run_on("m0", tmp_path / "own", observations).actions) == 3
+
+
+@needs_board
+@pytest.mark.parametrize(
+    ("board", "said"), [("m1", "BOARD is m4f or m0, not m1"), ("m0", "sb3-sparse export MODEL")]
+)
+def test_make_says_what_is_missing(board, said, tmp_path):
+    command = ["make", "-f", str(EXAMPLE / "Makefile"), f"BOARD={board}", f"IN={tmp_path}"]
+    done = subprocess.run(
+        [*command, f"BUILD={tmp_path / 'build'}"], capture_output=True, text=True, timeout=100
+    )
+    assert done.returncode != 0
+    assert said in done.stderr
+
+
+@needs_board
 @pytest.mark.parametrize("board", BOARDS)
 def test_eight_bit_weights_act_on_a_board_as_the_rounded_weights_do(board, tmp_path):
     model = MODELS["SAC"]()
