@@ -36,13 +36,17 @@ BIAS = 2**29 - 1
 LEAST = 127
 """Hidden values have 8 bits or more."""
 FARTHEST_SHIFT = 30
+"""Half of ``2^30`` is what a row's bias may hold beside these two sums."""
 HEADROOM = 2.0
 """Ranges are so many times the largest values seen."""
 FLAT = {"tanh": 6.0, "sigmoid": 12.0}
 """Where a function has reached its bounds of 1 to 1e-5."""
 TINY = 1e-300
+"""Stands for the factor of a row without weights and bias, by which a number is divided."""
 JUMPS = ("hardshrink", "threshold")
 """Functions that jump, so that lines between the points of a table are no match."""
+LIMIT = 2**31 - 1
+"""Largest 32-bit number."""
 
 
 def integer_graph(graph: Graph, observations: Observations) -> Graph:
@@ -93,10 +97,10 @@ def _largest(graph: Graph, observations: Observations) -> list[NDArray[np.float6
     for first in range(0, count_of(observations), BATCH):
         values = graph.values(rows_of(observations, first, first + BATCH))
         flat = [value.reshape(-1, value.shape[-1]).astype(np.float64) for value in values]
-        ends = [np.stack([value.min(axis=1), value.max(axis=1)]) for value in flat]
+        extremes = [np.stack([value.min(axis=1), value.max(axis=1)]) for value in flat]
         found = [
             np.stack([np.minimum(a[0], b[0]), np.maximum(a[1], b[1])])
-            for a, b in zip(found or ends, ends, strict=True)
+            for a, b in zip(found or extremes, extremes, strict=True)
         ]
     return found
 
@@ -105,11 +109,11 @@ def _largest(graph: Graph, observations: Observations) -> list[NDArray[np.float6
 class _Conversion:
     """Makes the new nodes.
 
-    :param ends: the least and the largest number of each unit, by value
+    :param extremes: the least and the largest number of each unit, by value
     """
 
     old: Graph
-    ends: list[NDArray[np.float64]]
+    extremes: list[NDArray[np.float64]]
     nodes: list[Node] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -148,14 +152,17 @@ class _Conversion:
         if taken not in self.whole:
             self._quantize(taken)
         most = self._most(taken)
-        unit = np.maximum(_scales(layer, self.ranges[taken]) / most, np.abs(layer.bias) / BIAS)
-        weight = _rounded(layer.weight * self.ranges[taken] / most, unit[:, None]).astype(np.int8)
+        scale, numbers = _whole_weights(layer, self.ranges[taken], most)
+        unit = scale / most
+        weight = numbers.astype(np.int8)
         bias = _rounded(layer.bias, unit)
         place = self.places[taken] if taken in self.whole else self.quantized[taken]
         if value not in self.whole:
-            scale = unit.astype(np.float32)
+            _check_sums(numbers, most, bias)
             return self._add(
-                Dequantized((place,), layer.shape, weight, bias.astype(np.int32), scale)
+                Dequantized(
+                    (place,), layer.shape, weight, bias.astype(np.int32), unit.astype(np.float32)
+                )
             )
         result = self.relus.get(value, value)
         self.ranges[result] = max(self._range(result, layer), unit.max() * 2.0**FRACTION)
@@ -165,6 +172,7 @@ class _Conversion:
         shift = np.clip(np.floor(np.log2(free)), 0, FARTHEST_SHIFT).astype(np.uint8)
         multiplier = np.minimum(np.rint(factor * 2.0 ** (FRACTION + shift)), largest)
         half = np.where(shift > 0, 2.0 ** (shift - 1.0), 0.0)
+        _check_sums(numbers, most, bias, half)
         return self._add(
             Requantized(
                 (place,),
@@ -211,10 +219,10 @@ class _Conversion:
         """
         if maker.name in FLAT:
             return 1.0
-        most = HEADROOM * float(_positive(np.abs(self.ends[value]).max()))
+        most = HEADROOM * float(_positive(np.abs(self.extremes[value]).max()))
         kinds = [self.old.nodes[reader - 1].name for reader in self._readers(value)]
         most = min(most, max((FLAT.get(kind, np.inf) for kind in kinds), default=np.inf))
-        # The rows of a layer end between the half and the whole of its range.
+        # Shifts are whole, so that a row reaches at least half of its layer's range, not all of it.
         return 2.0 * most if isinstance(maker, Linear) else most
 
     def _range_of_units(self, value: int) -> NDArray[np.float64]:
@@ -222,9 +230,9 @@ class _Conversion:
 
         A unit that never moved tells nothing about its range; it gets the median of the others.
         """
-        ends = self.ends[value]
-        most = np.abs(ends).max(axis=0)
-        moved = ends[0] < ends[1]
+        least, greatest = self.extremes[value]
+        most = np.maximum(np.abs(least), np.abs(greatest))
+        moved = least < greatest
         usual = np.median(most[moved]) if moved.any() else 1.0
         ranges: NDArray[np.float64] = HEADROOM * _positive(
             np.where(moved, most, np.maximum(most, usual))
@@ -238,8 +246,7 @@ class _Conversion:
             layer = self.old.nodes[reader - 1]
             if not isinstance(layer, Linear):
                 continue
-            ranges = self.ranges[value]
-            numbers = _rounded(layer.weight * ranges, _scales(layer, ranges)[:, None])
+            _, numbers = _whole_weights(layer, self.ranges[value])
             most = min(most, int(PRODUCTS // max(np.abs(numbers).sum(axis=1).max(), 1.0)))
         if most < LEAST:
             raise UnsupportedError(
@@ -249,10 +256,26 @@ class _Conversion:
         return most
 
 
-def _scales(layer: Linear, ranges: Any) -> NDArray[np.float64]:
-    """Return the scale of each row's 8-bit weights, for inputs divided by their ranges."""
-    most: NDArray[np.float64] = np.abs(layer.weight * ranges).max(axis=1, initial=0.0)
-    return most.astype(np.float64) / LARGEST
+def _whole_weights(
+    layer: Linear, ranges: Any, most: int = 0
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the scale of each row, and its weights as 8-bit numbers.
+
+    :param ranges: of the inputs, which are divided by them
+    :param most: largest whole number of an input, by which the scale makes the bias small enough;
+        0: the bias is left out of account, which makes no number smaller
+    """
+    weight = layer.weight.astype(np.float64) * ranges
+    largest = np.abs(weight).max(axis=1, initial=0.0)
+    scale = np.maximum(largest / LARGEST, np.abs(layer.bias.astype(np.float64)) * most / BIAS)
+    return scale, _rounded(weight, scale[:, None])
+
+
+def _check_sums(
+    weights: NDArray[np.float64], most: int, bias: NDArray[np.float64], half: Any = 0.0
+) -> None:
+    """Assert that no sum of a layer overflows, whatever its inputs."""
+    assert (np.abs(weights).sum(axis=1) * most + np.abs(bias) + half).max() <= LIMIT
 
 
 def _rounded(numbers: NDArray[Any], unit: NDArray[Any]) -> NDArray[np.float64]:

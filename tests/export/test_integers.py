@@ -226,6 +226,23 @@ def test_wide_layers_have_inputs_of_fewer_bits_so_that_no_sum_overflows():
         integer_graph(chain(67_000, (np.ones((1, 67_000)), [0])), np.ones((2, 67_000)))
 
 
+@pytest.mark.parametrize("seed", range(20))
+def test_weights_halfway_between_two_numbers_stay_within_the_bounds_too(seed):
+    """Largest weight 127, others whole or half: whichever way halves go, the sums must hold."""
+    random = np.random.default_rng(seed)
+    weight = random.integers(-254, 255, size=(2, 3000)) / 2
+    weight[:, 0] = 127
+    bias = random.normal(size=2) * [1.0, 1e9]
+    seen = random.uniform(0.1, 3) * np.float32([np.ones(3000), -np.ones(3000)])
+    whole = integer_graph(chain(3000, (weight, bias), (weight[:, :2], bias)), seen)
+    check_bounds(whole)
+    first, hidden, _ = whole.nodes
+    sums = np.abs(hidden.weight.astype(int)).sum(axis=1) * first.most
+    assert sums.max() <= 2**30 - 1
+    half = np.where(hidden.shift > 0, 2.0 ** (hidden.shift - 1.0), 0)
+    assert np.abs(hidden.bias - half).max() <= 2**29 - 1
+
+
 def test_values_up_to_twice_those_seen_are_not_clipped():
     random = np.random.default_rng(4)
     graph = random_chain(random, [3, 50, 2], 1.0)
