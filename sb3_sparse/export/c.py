@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import textwrap
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,11 +10,12 @@ from numpy.typing import NDArray
 
 from sb3_sparse.export import ckernels
 from sb3_sparse.export.cfunctions import FUNCTIONS
-from sb3_sparse.export.cheader import WIDTH, about, declarations, prototype
+from sb3_sparse.export.cheader import about, declarations, prototype
 from sb3_sparse.export.cintegers import integer_call
+from sb3_sparse.export.ctables import BYTES, Tables, number
 from sb3_sparse.export.graph import Graph
 from sb3_sparse.export.integers import IntegerLinear, Lookup, Quantize
-from sb3_sparse.export.layout import grouped, side_by_side
+from sb3_sparse.export.layout import grouped, index_bits, is_smaller_dense, side_by_side
 from sb3_sparse.export.memory import Memory, bordered_shape, plan_memory
 from sb3_sparse.export.nodes import (
     Activation,
@@ -37,16 +37,6 @@ from sb3_sparse.export.nodes import (
 )
 from sb3_sparse.export.output_nodes import Constant, Largest
 from sb3_sparse.export.quantize import quantize_rows
-
-BYTES = {
-    "float": 4,
-    "int8_t": 1,
-    "uint8_t": 1,
-    "int16_t": 2,
-    "uint16_t": 2,
-    "int32_t": 4,
-    "uint32_t": 4,
-}
 
 
 @dataclass(frozen=True)
@@ -73,15 +63,15 @@ def write_c(graph: Graph, version: str, int8: bool = False) -> CSource:
     :param int8: store weights as 8-bit whole numbers with a scale for each row
     """
     writer = _Writer(graph, plan_memory(graph), int8)
-    for number, node in enumerate(graph.nodes):
-        writer.write(number + 1, node)
-    tables = "\n".join(writer.tables)
+    for value, node in enumerate(graph.nodes, start=1):
+        writer.write(value, node)
+    tables = "\n".join(writer.tables.texts)
     functions = "\n".join(writer.functions.values())
     body = "\n".join(f"    {line}" for line in writer.calls)
     ram = writer.memory.bytes
     arrays = {"float memory": writer.memory.size, "int16_t whole": writer.memory.whole}
     memory = "".join(f"static {name}[{size}];\n\n" for name, size in arrays.items() if size)
-    comment = about(graph, version, writer.flash, ram)
+    comment = about(graph, version, writer.tables.bytes, ram)
     includes = "#include <stdint.h>\n"
     if any(f"{name}(" in functions for name in ckernels.MATH):
         includes = "#include <math.h>\n" + includes
@@ -90,7 +80,7 @@ def write_c(graph: Graph, version: str, int8: bool = False) -> CSource:
         f"{prototype(graph)}\n{{\n{body}\n}}\n"
     )
     header = comment + declarations(graph)
-    return CSource(source, header, writer.flash, ram)
+    return CSource(source, header, writer.tables.bytes, ram)
 
 
 class _Writer:
@@ -100,9 +90,8 @@ class _Writer:
         self.graph = graph
         self.memory = memory
         self.int8 = int8
-        self.flash = 0
+        self.tables = Tables()
         self.functions: dict[str, str] = {}
-        self.tables: list[str] = []
         self.calls: list[str] = []
 
     def write(self, value: int, node: Node) -> None:
@@ -123,7 +112,7 @@ class _Writer:
             sizes = self._table("sizes", node.sizes, "uint32_t")
             self._call(node.op, x, y, len(node.sizes), sizes)
         elif isinstance(node, Standardize):
-            self._call("standardize", x, y, _size(node), _number(node.eps))
+            self._call("standardize", x, y, _size(node), number(node.eps))
         elif isinstance(node, Largest):
             self._call("largest", x, y, int(np.prod(self.graph.shape_of(node.inputs[0]))))
         elif isinstance(node, Constant):
@@ -150,6 +139,7 @@ class _Writer:
             self._elementwise(node, x, y, [_size(node)], {})
         else:
             assert isinstance(node, (Flatten, Slice))  # the same numbers in the same order
+            assert self.graph.name_of(value) is None  # the caller's array would stay unwritten
 
     def _call(self, function: str, *arguments: object, source: str = "") -> None:
         """Append a call.
@@ -163,7 +153,7 @@ class _Writer:
         self, node: Node, x: str, y: str, size: list[object], fields: dict[str, NDArray[Any]]
     ) -> None:
         arguments = [
-            self._table(name, field, "float") if field.ndim else _number(field)
+            self._table(name, field, "float") if field.ndim else number(field)
             for name, field in fields.items()
         ]
         kind = node.op if isinstance(node, PerUnit) else node.name
@@ -176,8 +166,8 @@ class _Writer:
     def _linear(self, layer: Linear, x: str, y: str) -> None:
         rows, scales = self._rows(layer)
         longest = int(np.count_nonzero(rows, axis=1).max())
-        bits = self._bits(max(longest, rows.shape[1] - 1))
-        if rows.size * self._width <= np.count_nonzero(rows) * (self._width + bits // 8):
+        bits = index_bits(rows.shape[1], longest)
+        if is_smaller_dense(rows, BYTES[self._type], bits):
             name, source_bits = "linear_dense" + "_int8" * self.int8, None
             tables = [str(rows.shape[1]), self._table("value", side_by_side(rows), self._type)]
         else:
@@ -199,11 +189,11 @@ class _Writer:
         _, inputs, height, width = layer.weight.shape
         across = shape[2]
         places = np.arange(int(np.prod(shape))).reshape(shape)[:, :height, :width].reshape(-1)
-        bits = self._bits(int(np.prod(shape)))
+        active = [np.flatnonzero(row) for row in rows]
+        bits = index_bits(places.max() + 1, max(map(len, active)))
         full = bool((rows != 0).all())
         index = ckernels.INDEX_TYPES[bits]
         name = f"conv_{bits}" + "_full" * full + "_int8" * self.int8
-        active = [np.flatnonzero(row) for row in rows]
         if full:
             tables = [str(rows.shape[1]), self._table("offset", places, index)]
         else:
@@ -234,7 +224,7 @@ class _Writer:
         if with_border is None:
             return x, shape
         y = f"memory + {self.memory.borders[self.value]}"
-        self._call("bordered", x, y, *shape, *node.padding, _number(border))
+        self._call("bordered", x, y, *shape, *node.padding, number(border))
         return y, with_border
 
     def _rows(self, layer: Weighted) -> tuple[NDArray[Any], NDArray[Any]]:
@@ -246,18 +236,6 @@ class _Writer:
     @property
     def _type(self) -> str:
         return "int8_t" if self.int8 else "float"
-
-    @property
-    def _width(self) -> int:
-        return BYTES[self._type]
-
-    @staticmethod
-    def _bits(most: int) -> int:
-        """Return the bits of indices and lengths.
-
-        :param most: the largest of them
-        """
-        return next(bits for bits in ckernels.INDEX_TYPES if most < 2**bits)
 
     def _place(self, value: int) -> str:
         if value == 0:
@@ -273,26 +251,8 @@ class _Writer:
         return f"{array} + {self.memory.places[value]}"
 
     def _table(self, name: str, numbers: Any, kind: str) -> str:
-        """Append a constant array and return its name."""
-        flat = np.asarray(numbers).reshape(-1)
-        name = f"{name}_{self.value}"
-        if not flat.size:
-            flat = np.zeros(1, flat.dtype)  # C has no arrays of length 0
-        self.flash += flat.size * BYTES[kind]
-        texts = map(_number, flat) if kind == "float" else map(str, flat.tolist())
-        lines = textwrap.wrap(
-            ", ".join(texts), WIDTH - 4, break_long_words=False, break_on_hyphens=False
-        )
-        body = "\n".join(f"    {line}" for line in lines)
-        self.tables.append(f"static const {kind} {name}[{flat.size}] = {{\n{body}\n}};")
-        return name
-
-
-def _number(value: Any) -> str:
-    """Return the shortest literal that C reads back as the same float."""
-    largest = np.finfo(np.float32).max  # C has no literal for infinity
-    text = str(np.float32(np.clip(value, -largest, largest)))
-    return f"{text}f" if "." in text or "e" in text else f"{text}.0f"
+        """Append a constant array of the node and return its name."""
+        return self.tables.add(f"{name}_{self.value}", numbers, kind)
 
 
 def _size(node: Node) -> str:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from sb3_sparse.export.cheader import WIDTH
+from sb3_sparse.export.ckernels import INDEX_TYPES
 from sb3_sparse.export.integers import (
     MOST,
     Dequantized,
@@ -18,6 +19,7 @@ from sb3_sparse.export.integers import (
     Quantize,
     Requantized,
 )
+from sb3_sparse.export.layout import index_bits, is_smaller_dense
 from sb3_sparse.export.nodes import Node
 
 Table = Callable[[str, Any, str], str]
@@ -104,10 +106,10 @@ def integer_call(node: Node, table: Table) -> tuple[str, list[object], dict[str,
     assert isinstance(node, IntegerLinear)
     rows = node.weight
     active = [np.flatnonzero(row) for row in rows]
-    index = _index(rows.shape[1], max(map(len, active)))
+    bits = index_bits(rows.shape[1], max(map(len, active)))
+    index = INDEX_TYPES[bits]
     arguments = [len(rows)]
-    nnz = sum(map(len, active))
-    if dense := rows.size <= nnz * (1 + np.dtype(index.removesuffix("_t")).itemsize):
+    if dense := is_smaller_dense(rows, rows.itemsize, bits):
         arguments += [rows.shape[1], table("value", rows, "int8_t")]
     else:
         arguments += [
@@ -116,7 +118,7 @@ def integer_call(node: Node, table: Table) -> tuple[str, list[object], dict[str,
             table("value", rows[rows != 0], "int8_t"),
         ]
     arguments.append(table("bias", node.bias, "int32_t"))
-    name = node.op + ("_dense" if dense else f"_{index.removesuffix('_t').removeprefix('uint')}")
+    name = node.op + ("_dense" if dense else f"_{bits}")
     if isinstance(node, Requantized):
         arguments += [
             table("multiplier", node.multiplier, "uint16_t"),
@@ -127,13 +129,6 @@ def integer_call(node: Node, table: Table) -> tuple[str, list[object], dict[str,
     assert isinstance(node, Dequantized)
     arguments.append(table("scale", node.scale, "float"))
     return name, arguments, {name: _linear(name, dense, index, False)}
-
-
-def _index(columns: int, longest: int) -> str:
-    """Return the type of a layer's columns and lengths."""
-    if columns <= 2**8 and longest < 2**8:
-        return "uint8_t"
-    return "uint16_t" if columns <= 2**16 and longest < 2**16 else "uint32_t"
 
 
 def _linear(name: str, dense: bool, index: str, hidden: bool) -> str:

@@ -1,4 +1,4 @@
-"""Orders the weights of a linear layer for C."""
+"""Orders the weights of a layer for C, and chooses how they are stored."""
 
 from __future__ import annotations
 
@@ -7,7 +7,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_sparse.export.ckernels import GROUP
+from sb3_sparse.export.ckernels import GROUP, INDEX_TYPES
+
+
+def index_bits(columns: int, longest: int) -> int:
+    """Return the bits of a layer's indices and of the lengths of its rows.
+
+    :param columns: number of inputs
+    :param longest: most connections of a row
+    """
+    return next(bits for bits in INDEX_TYPES if max(columns - 1, longest) < 2**bits)
+
+
+def is_smaller_dense(rows: NDArray[Any], width: int, bits: int) -> bool:
+    """Tell whether all weights take no more bytes than those that are not 0, with their indices.
+
+    :param width: bytes of a weight
+    :param bits: bits of an index
+    """
+    return bool(rows.size * width <= np.count_nonzero(rows) * (width + bits // 8))
 
 
 def grouped(rows: NDArray[Any]) -> tuple[list[int], NDArray[Any], NDArray[Any]]:

@@ -15,7 +15,7 @@ from sb3_sparse.export.artifact import OPTIONS, compiled
 from sb3_sparse.export.c import write_c
 from sb3_sparse.export.extract import graph_of
 from sb3_sparse.export.graph import Graph
-from sb3_sparse.export.layout import grouped
+from sb3_sparse.export.layout import grouped, index_bits, is_smaller_dense
 from sb3_sparse.export.memory import plan_memory
 from sb3_sparse.export.nodes import Add, Conv, Flatten
 from sb3_sparse.export.observations import random_observations
@@ -185,6 +185,25 @@ def test_nothing_is_written_over_a_value_that_another_view_of_it_shows():
     check_memory(graph)
     seen = np.float32([[[[-3.0, 4.0]]]])
     np.testing.assert_array_equal(compiled(write_c(graph, "0").source, graph)(seen), [[-3, 8]])
+
+
+def test_an_output_that_nothing_would_write_is_refused():
+    layer = Conv((0,), (1, 1, 2), np.ones((1, 1, 1, 1), np.float32), np.zeros(1), (1, 1), (0, 0))
+    with pytest.raises(AssertionError):
+        write_c(Graph((1, 1, 2), (layer, Flatten((1,), (2,))), (2,)), "0")
+
+
+@pytest.mark.parametrize(("columns", "bits"), [(256, 8), (257, 16), (2**16, 16), (2**16 + 1, 32)])
+def test_indices_have_as_many_bits_as_columns_and_lengths_need(columns, bits):
+    assert index_bits(columns, longest=1) == bits
+    assert index_bits(columns=1, longest=columns - 1) == bits
+
+
+def test_a_layer_is_dense_where_its_indices_would_cost_more_than_its_zeros():
+    rows = np.float32([[1, 2, 0, 0], [3, 4, 5, 0]])  # 8 weights, 5 of them not 0
+    assert is_smaller_dense(rows, width=4, bits=32)  # 32 bytes against 5 * 8
+    assert not is_smaller_dense(rows, width=4, bits=16)  # 32 against 5 * 6
+    assert is_smaller_dense(rows, width=1, bits=8)  # 8 against 10
 
 
 def check_memory(graph: Graph):
