@@ -33,7 +33,7 @@ from stable_baselines3 import SAC
 
 from sb3_sparse import SparsePolicy
 from sb3_sparse.export import export_policy
-from sb3_sparse.export.artifact import compiler
+from sb3_sparse.export.compiler import compiler
 from sb3_sparse.sparsity import equivalent_widths, mlp_parameters
 
 SIZES = ("17-256-256-6", "348-256-256-17", "348-1024-1024-17")

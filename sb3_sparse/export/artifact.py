@@ -2,12 +2,7 @@
 
 from __future__ import annotations
 
-import ctypes
 import io
-import os
-import shlex
-import shutil
-import subprocess
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -19,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from sb3_sparse.errors import ConfigError, MissingExtra, UnsupportedError
+from sb3_sparse.errors import ConfigError, MissingExtra
 from sb3_sparse.export import numpy_policy
 from sb3_sparse.export.c import write_c
+from sb3_sparse.export.compiler import compiled
 from sb3_sparse.export.dense import write_dense
 from sb3_sparse.export.graph import Graph
 from sb3_sparse.export.npz import write_npz
@@ -32,9 +28,6 @@ from sb3_sparse.export.units import sort_units
 from sb3_sparse.policies.base import BaseSparsePolicy
 from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.policies.saving import load_without_buffer
-
-COMPILERS = ("cc", "gcc", "clang")
-OPTIONS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror")
 
 
 @dataclass(frozen=True)
@@ -180,64 +173,3 @@ def dense_artifact(model: BaseAlgorithm, normalised: bool) -> Artifact:
     if isinstance(policy, BaseSparsePolicy) and policy.sparse.weight_decay:
         notes.append("weight_decay is left out: only sparse policies have it")
     return Artifact({".zip": content}, actor, tuple(notes))
-
-
-def compiler() -> list[str]:
-    """Return the command of a C compiler: ``$CC``, else cc, gcc or clang.
-
-    :raises UnsupportedError: if there is none
-    """
-    try:
-        command = shlex.split(os.environ.get("CC", ""))
-    except ValueError as error:
-        raise UnsupportedError(f"CC={os.environ['CC']!r} is not a command: {error}") from error
-    names = [command[0]] if command else list(COMPILERS)
-    for name in names:
-        found = shutil.which(name)
-        if found is not None:
-            return [found, *command[1:]]
-    raise UnsupportedError(
-        f"a C export is compiled and run to check it, but there is no {' or '.join(names)} here; "
-        "install gcc or clang, name a compiler in the environment variable CC, or write the export "
-        "unchecked with force (--force)"
-    )
-
-
-def compiled(source: str, graph: Graph, options: tuple[str, ...] = OPTIONS) -> Actor:
-    """Compile a policy; return a function that calls it through ctypes.
-
-    :param graph: gives the sizes of observation and outputs
-    """
-    with tempfile.TemporaryDirectory() as folder:
-        path, library = Path(folder) / "policy.c", Path(folder) / "policy.so"
-        path.write_text(source)
-        command = [*compiler(), *options, "-shared", "-fPIC", str(path), "-o", str(library), "-lm"]
-        done = subprocess.run(command, capture_output=True, text=True)
-        if done.returncode:
-            raise UnsupportedError(
-                f"{shlex.join(command[:1])} cannot compile the C export (exit code "
-                f"{done.returncode}): {done.stderr.strip() or 'no message'}. Name another "
-                "compiler in CC, or write it unchecked with force (--force)"
-            )
-        try:
-            function = ctypes.CDLL(str(library)).sb3_sparse_policy
-        except OSError as error:
-            raise UnsupportedError(
-                f"what {shlex.join(compiler())} builds does not run here ({error}), so the C "
-                "export cannot be checked; name a compiler for this machine in CC, or write it "
-                "unchecked with force (--force)"
-            ) from error
-    numbers = ctypes.POINTER(ctypes.c_float)
-    sizes = list(graph.sizes.values())
-    starts = np.cumsum([0, *sizes[:-1]])
-    function.argtypes, function.restype = [numbers] * (1 + len(sizes)), None
-
-    def run(observations: Observations) -> NDArray[Any]:
-        rows = np.ascontiguousarray(graph.rows(observations).reshape(count_of(observations), -1))
-        results = np.empty((len(rows), sum(sizes)), np.float32)
-        for row, result in zip(rows, results, strict=True):
-            written = (result[start:].ctypes.data_as(numbers) for start in starts)
-            function(row.ctypes.data_as(numbers), *written)
-        return results
-
-    return run

@@ -14,6 +14,7 @@ from sb3_sparse.export.cheader import about, declarations, prototype
 from sb3_sparse.export.cintegers import integer_call
 from sb3_sparse.export.ctables import BYTES, Tables, number
 from sb3_sparse.export.graph import Graph
+from sb3_sparse.export.inexact import inexact_quantizations
 from sb3_sparse.export.integers import IntegerLinear, Lookup, Quantize
 from sb3_sparse.export.layout import grouped, index_bits, is_smaller_dense, side_by_side
 from sb3_sparse.export.memory import Memory, bordered_shape, plan_memory
@@ -37,6 +38,11 @@ from sb3_sparse.export.nodes import (
 )
 from sb3_sparse.export.output_nodes import Constant, Largest
 from sb3_sparse.export.quantize import quantize_rows
+
+CHECK = "SB3_SPARSE_CHECK"
+"""The macro under which a policy keeps the whole numbers that its inexact floats became."""
+CHECKED = "sb3_sparse_quantized"
+"""The array in which it keeps them."""
 
 
 @dataclass(frozen=True)
@@ -67,10 +73,11 @@ def write_c(graph: Graph, version: str, int8: bool = False) -> CSource:
         writer.write(value, node)
     tables = "\n".join(writer.tables.texts)
     functions = "\n".join(writer.functions.values())
-    body = "\n".join(f"    {line}" for line in writer.calls)
+    body = "\n".join(line if line.startswith("#") else f"    {line}" for line in writer.calls)
     ram = writer.memory.bytes
     arrays = {"float memory": writer.memory.size, "int16_t whole": writer.memory.whole}
     memory = "".join(f"static {name}[{size}];\n\n" for name, size in arrays.items() if size)
+    memory += writer.kept_numbers()
     comment = about(graph, version, writer.tables.bytes, ram)
     includes = "#include <stdint.h>\n"
     if any(f"{name}(" in functions for name in ckernels.MATH):
@@ -93,6 +100,21 @@ class _Writer:
         self.tables = Tables()
         self.functions: dict[str, str] = {}
         self.calls: list[str] = []
+        self.kept: dict[int, int] = {}
+        """Where the numbers of inexact quantizations begin in the array that a check reads."""
+        self.kept_size = 0
+        for value in inexact_quantizations(graph):
+            self.kept[value] = self.kept_size
+            self.kept_size += int(np.prod(graph.shape_of(value)))
+
+    def kept_numbers(self) -> str:
+        """Return the declaration of that array, which only a check compiles."""
+        if not self.kept:
+            return ""
+        return (
+            f"#ifdef {CHECK}\n/* What floats became, for a check that may add them up in another "
+            f"order. */\nint16_t {CHECKED}[{self.kept_size}];\n#endif\n\n"
+        )
 
     def write(self, value: int, node: Node) -> None:
         """Append the code that computes a node's result."""
@@ -106,6 +128,11 @@ class _Writer:
             name, arguments, sources = integer_call(node, self._table)
             self.functions |= sources
             self._call(name, x, y, *arguments, source=sources[name])
+            if value in self.kept:
+                again = f"{CHECKED} + {self.kept[value]}"
+                self.calls.append(f"#ifdef {CHECK}")
+                self._call(name, x, again, *arguments, source=sources[name])
+                self.calls.append("#endif")
         elif isinstance(node, MaxPool):
             self._max_pool(node, x, y)
         elif isinstance(node, (Argmax, OneHot)):

@@ -126,6 +126,9 @@ class Graph:
 
     def run(self, observations: Any) -> NDArray[Any]:
         """Compute all outputs of a batch of observations, side by side in a row for each."""
-        values = self.values(observations)
+        return self.side_by_side(self.values(observations))
+
+    def side_by_side(self, values: list[NDArray[Any]]) -> NDArray[Any]:
+        """Return the outputs among all values, side by side in a row for each observation."""
         results = [np.moveaxis(values[output.value], -1, 0) for output in self.outputs]
         return np.concatenate([result.reshape(len(result), -1) for result in results], axis=1)

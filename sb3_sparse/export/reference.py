@@ -12,8 +12,12 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy, BaseModel
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_sparse.export.compiler import Compiled
+from sb3_sparse.export.graph import Graph
+from sb3_sparse.export.inexact import adopted, inexact_quantizations
+from sb3_sparse.export.integers import Quantize
 from sb3_sparse.export.observations import Observations, count_of
-from sb3_sparse.export.parity import Actor
+from sb3_sparse.export.parity import TOLERANCE, Actor
 from sb3_sparse.policies.registry import sparse_counterpart
 
 
@@ -39,6 +43,36 @@ def predictor(
             found = _further(policy, seen, further)
             rows += [found[name].detach().cpu().numpy() for name in further]
         return np.concatenate([np.reshape(r, (count_of(observations), -1)) for r in rows], axis=1)
+
+    return run
+
+
+def rounded(graph: Graph, exported: Actor) -> Actor:
+    """Return a function that runs a policy with rounded weights or whole numbers.
+
+    Where ``exported`` made whole numbers of floats that may differ in their last bits, its numbers
+    are taken if the floats differ by no more than an action may, relative to their unit's range.
+
+    :param exported: the same policy, compiled
+    """
+    places = inexact_quantizations(graph)
+    if not places:
+        return graph.run
+    assert isinstance(exported, Compiled)
+    ends = np.cumsum([int(np.prod(graph.shape_of(value))) for value in places])[:-1]
+
+    def run(observations: Observations) -> NDArray[Any]:
+        _, numbers = exported.outputs_and_numbers(observations)
+        others = dict(zip(places, np.split(numbers.T, ends), strict=True))
+        values: list[NDArray[Any]] = [np.moveaxis(graph.rows(observations), 0, -1)]
+        for value, node in enumerate(graph.nodes, start=1):
+            taken = [values[i] for i in node.inputs]
+            if value in others:
+                assert isinstance(node, Quantize)
+                values.append(adopted(node, taken[0], others[value], TOLERANCE))
+            else:
+                values.append(node.run(*taken))
+        return graph.side_by_side(values)
 
     return run
 

@@ -29,7 +29,7 @@ from sb3_sparse.export.observations import (
 )
 from sb3_sparse.export.parity import Parity, ParityError, compare
 from sb3_sparse.export.quantize import quantized
-from sb3_sparse.export.reference import predictor
+from sb3_sparse.export.reference import predictor, rounded
 from sb3_sparse.export.sbx import NOT_CARRIED, as_sb3, is_sbx_model
 from sb3_sparse.export.units import remove_dead_units, units_of
 from sb3_sparse.loading.statistics import read_statistics
@@ -168,7 +168,7 @@ def export_policy(
         check_recorded(observations, space)
     if to == "dense":
         artifact = dense_artifact(model, normalization is not None)
-        normalization = written = rounded = None  # a zip of SB3 does not normalise by itself
+        normalization = written = twin = None  # a zip of SB3 does not normalise by itself
         nnz = _connections(model)
         counts = {"nnz": nnz, "exported_nnz": nnz}
         further = {}
@@ -179,7 +179,7 @@ def export_policy(
         exact = remove_dead_units(fold(raw))
         written = integer_graph(exact, observations) if bits == "full" else exact
         artifact = GRAPH_ARTIFACTS[to](written, bits is not None)
-        rounded = quantized(written).run if bits else None
+        twin = quantized(written) if bits else None
         counts = _counts(raw, exact)
         _, *others = exact.sizes.items()
         further = dict(others)
@@ -204,8 +204,8 @@ def export_policy(
             raise
         notes.append(f"written unchecked, as you asked: {error}")
     else:
-        parity = checked(rounded or own, actor, observations, random)
-        if rounded:  # whole numbers have the ranges of recorded observations
+        parity = checked(own if twin is None else rounded(twin, actor), actor, observations, random)
+        if twin is not None:  # whole numbers have the ranges of recorded observations
             met = None if bits == "full" else random
             rounding = checked(own, actor, observations, met)
     if parity is not None and not parity.holds:

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from support import TinyImages, make
 
 from sb3_sparse.export import export_policy
-from sb3_sparse.export.artifact import OPTIONS, compiled
 from sb3_sparse.export.c import write_c
+from sb3_sparse.export.compiler import OPTIONS, compiled
 from sb3_sparse.export.extract import graph_of
 from sb3_sparse.export.graph import Graph
 from sb3_sparse.export.layout import grouped, index_bits, is_smaller_dense

@@ -16,7 +16,7 @@ from torch import nn
 from sb3_sparse import sparsify
 from sb3_sparse.errors import ConfigError, UnsupportedError
 from sb3_sparse.export import FORMATS, export_policy, record_observations
-from sb3_sparse.export.artifact import compiled
+from sb3_sparse.export.compiler import compiled
 from sb3_sparse.export.extract import graph_of
 from sb3_sparse.export.fold import fold
 from sb3_sparse.export.graph import Graph

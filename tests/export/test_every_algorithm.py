@@ -9,7 +9,7 @@ from gymnasium import spaces
 from support import ALGORITHMS, TinyImages, make
 
 from sb3_sparse.export import FORMATS, export_policy
-from sb3_sparse.export.artifact import compiled
+from sb3_sparse.export.compiler import compiled
 from sb3_sparse.export.extract import graph_of
 from sb3_sparse.export.numpy_policy import Policy
 

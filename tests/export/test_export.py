@@ -25,7 +25,7 @@ from sb3_sparse.errors import (
     UnsupportedError,
 )
 from sb3_sparse.export import FORMATS, ParityError, export_policy, record_observations
-from sb3_sparse.export.artifact import compiled
+from sb3_sparse.export.compiler import compiled
 from sb3_sparse.export.extract import graph_of
 from sb3_sparse.export.parity import compare
 

@@ -4,7 +4,9 @@ import subprocess
 
 import numpy as np
 import pytest
+import torch as th
 from export.tools import COMPILER, chain, compiles, linear, random_chain, relu
+from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
@@ -12,16 +14,19 @@ from support import TinyImages, make
 
 from sb3_sparse.errors import ConfigError, UnsupportedError
 from sb3_sparse.export import Returns, export_policy, record_observations
-from sb3_sparse.export.artifact import OPTIONS, compiled
 from sb3_sparse.export.c import write_c
 from sb3_sparse.export.calibrate import integer_graph
+from sb3_sparse.export.compiler import OPTIONS, compiled
 from sb3_sparse.export.effect import play_both
 from sb3_sparse.export.extract import graph_of
+from sb3_sparse.export.fold import fold
 from sb3_sparse.export.graph import Graph
+from sb3_sparse.export.inexact import adopted, inexact_quantizations
 from sb3_sparse.export.integers import Dequantized, Lookup, Quantize, Requantized
-from sb3_sparse.export.nodes import Activation, Add, Standardize
+from sb3_sparse.export.nodes import Activation, Add, Clip, Conv, Flatten, Standardize
 from sb3_sparse.export.quantize import quantized
-from sb3_sparse.export.reference import predictor
+from sb3_sparse.export.reference import predictor, rounded
+from sb3_sparse.export.units import remove_dead_units
 
 MAIN = """
 #include <stdio.h>
@@ -349,6 +354,77 @@ def test_convolutions_and_norms_stay_floats(model, tmp_path):
     report = export_policy(model, tmp_path / "policy", int8="full", observations=seen)
     assert report.parity.holds
     assert report.rounding.difference < 0.1
+
+
+@pytest.mark.parametrize("side", [36, 48])
+def test_floats_that_are_added_up_in_another_order_are_no_difference(side, tmp_path):
+    """Each last bit may move a whole number by a step, which an action layer of gain 1 shows."""
+    env = TinyImages(False)
+    env.observation_space = spaces.Box(0, 255, (side, side, 1), np.uint8)
+    model = make("PPO", env)
+    th.nn.init.orthogonal_(model.policy.action_net.weight, 1.0)
+    seen = record_observations(model, model.get_env(), 50)
+    report = export_policy(model, tmp_path / "policy", int8="full", observations=seen)
+    assert report.parity.holds
+
+    whole = quantized(integer_graph(remove_dead_units(fold(graph_of(model, None))), seen))
+    source = (tmp_path / "policy.c").read_text()
+    right = compiled(source, whole)
+    steps = np.abs(right(seen) - whole.run(seen))
+    assert 1e-5 < steps.max() < 1e-3  # the same, were it not for these steps
+    np.testing.assert_allclose(right(seen), rounded(whole, right)(seen), atol=1e-5)
+    cut = source.replace("(twofold + (twofold < 0 ? -1 : 1)) / 2", "twofold / 2")
+    wrong = compiled(cut, whole)  # cuts where it should round
+    assert np.abs(wrong(seen) - rounded(whole, wrong)(seen)).max() > 1e-5
+
+
+def test_which_whole_numbers_may_differ():
+    def quantize(value):
+        return Quantize((value,), (2,), np.float32([2, 2]), 100)
+
+    eye = [[1, 0], [0, 1]]
+    kernel, bias = np.ones((2, 1, 1, 1), np.float32), np.zeros(2)
+    clip = Clip((0,), (2,), np.zeros(2), np.ones(2))
+    exact = [quantize(0)], [clip, quantize(1)], [relu(0, 2), quantize(1)]
+    for nodes in exact:
+        assert inexact_quantizations(Graph((2,), tuple(nodes))) == []
+    conv = Conv((0,), (2, 1, 1), kernel, bias, (1, 1), (0, 0))
+    tanh, sums = Activation((0,), (2,), "tanh"), linear(0, eye)
+    assert inexact_quantizations(Graph((1, 1, 1), (conv, Flatten((1,), (2,)), quantize(2)))) == [3]
+    for nodes in [tanh, quantize(1)], [sums, relu(1, 2), quantize(2)]:
+        assert inexact_quantizations(Graph((2,), tuple(nodes))) == [len(nodes)]
+    table = Lookup((2,), (2,), np.zeros(257, np.int16))
+    assert inexact_quantizations(Graph((2,), (sums, quantize(1), table, quantize(3)))) == [2]
+
+
+def test_another_s_number_is_taken_where_its_float_may_be_the_same():
+    node = Quantize((0,), (5,), np.full(5, 2, np.float32), 1000)
+    floats = np.float32([[0.5, 0.5, 0.498, 0.48, 5000]]).T  # a step is 1, and 1e-5 of 1000 is 0.01
+    other = np.array([[0, 1, 1, 1, 999]]).T
+    assert node.run(floats)[:, 0].tolist() == [1, 1, 0, 0, 1000]
+    assert adopted(node, floats, other, 1e-5)[:, 0].tolist() == [0, 1, 1, 0, 1000]
+
+
+def test_the_array_that_a_check_reads_costs_a_policy_nothing(tmp_path):
+    images = make("PPO", TinyImages(False))
+    seen = record_observations(images, images.get_env(), 20)
+    export_policy(images, tmp_path / "policy", int8="full", observations=seen)
+    symbols = {}
+    for options in ([], ["-DSB3_SPARSE_CHECK"]):
+        compiles = [COMPILER, *OPTIONS, *options, "-c", str(tmp_path / "policy.c"), "-o"]
+        subprocess.run([*compiles, str(tmp_path / "policy.o")], check=True)
+        said = subprocess.run(
+            ["nm", "-g", "--defined-only", str(tmp_path / "policy.o")],
+            capture_output=True,
+            text=True,
+        )
+        symbols[len(options)] = {line.split()[-1] for line in said.stdout.splitlines()}
+    assert symbols[0] == {"sb3_sparse_policy"}
+    assert symbols[1] == {"sb3_sparse_policy", "sb3_sparse_quantized"}
+    for model in (make("SAC"), make("PPO")):  # whose sums are all of whole numbers
+        seen = record_observations(model, model.get_env(), 20)
+        export_policy(model, tmp_path / "policy", int8="full", observations=seen)
+        assert "SB3_SPARSE_CHECK" not in (tmp_path / "policy.c").read_text()
 
 
 def test_the_return_is_reported_and_normalised_observations_are_taken_raw(tmp_path):

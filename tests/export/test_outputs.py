@@ -14,7 +14,7 @@ from support import ALGORITHMS, DISCRETE, TinyDicts, TinyImages, make
 
 from sb3_sparse.errors import ConfigError, UnsupportedError
 from sb3_sparse.export import ParityError, export_policy
-from sb3_sparse.export.artifact import OPTIONS, compiled
+from sb3_sparse.export.compiler import OPTIONS, compiled
 from sb3_sparse.export.extract import graph_of
 from sb3_sparse.export.fold import fold
 from sb3_sparse.export.numpy_policy import Policy

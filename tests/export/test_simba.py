@@ -15,8 +15,9 @@ from torch import nn
 from sb3_sparse.engine.residual import Residual
 from sb3_sparse.errors import UnsupportedError
 from sb3_sparse.export import export_policy
-from sb3_sparse.export.artifact import GRAPH_ARTIFACTS, compiled
+from sb3_sparse.export.artifact import GRAPH_ARTIFACTS
 from sb3_sparse.export.c import write_c
+from sb3_sparse.export.compiler import compiled
 from sb3_sparse.export.extract import graph_of
 from sb3_sparse.export.fold import fold
 from sb3_sparse.export.graph import Graph
