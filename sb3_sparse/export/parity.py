@@ -34,7 +34,8 @@ class Parity:
     :param discrete: whether actions are discrete, so that ``different`` counts
     :param worst: the observation for which actions differ most
     :param further: largest ``|a - b|`` of each further output, by its name, divided by its largest
-        ``|a|`` for any observation, or by 1 if that is smaller
+        ``|a|`` for any observation of the same kind, or by 1 if that is smaller; of ``std`` largest
+        ``|a - b| / |a|``
 
     Example::
 
@@ -86,10 +87,11 @@ def compare(
     :param further: number of elements of each further output, by its name
     """
     difference, different, worst = 0.0, 0, None
-    others = {name: _Largest() for name in further or {}}
+    others = dict.fromkeys(further or {}, 0.0)
     behind = np.cumsum([*(further or {}).values()][::-1])[::-1]
     """Columns from the beginning of each further output to the end of the row."""
     for observations in (recorded, random):
+        largest = {name: _Largest(relative=name == "std") for name in others}
         for first in range(0, count_of(observations), BATCH):
             batch = rows_of(observations, first, first + BATCH)
             both = (actor(batch).astype(np.float64) for actor in (model, exported))
@@ -102,24 +104,31 @@ def compare(
                 difference = float(apart.max())
                 row = int(apart.argmax())
                 worst = rows_of(batch, row, row + 1)
-            for largest, pair in zip(others.values(), pairs, strict=True):
-                largest.see(*pair)
+            for found, pair in zip(largest.values(), pairs, strict=True):
+                found.see(*pair)
+        others = {name: max(others[name], found.difference) for name, found in largest.items()}
     seen = (count_of(recorded), count_of(random))
-    beside = {name: largest.difference for name, largest in others.items()}
-    return Parity(*seen, difference, different, discrete, worst, beside)
+    return Parity(*seen, difference, different, discrete, worst, others)
 
 
 class _Largest:
-    """The largest difference of a further output, and its largest number."""
+    """The largest difference of a further output, and its largest number.
 
-    def __init__(self) -> None:
-        self.apart, self.size = 0.0, 1.0
+    :param relative: whether each difference counts relative to its own number
+    """
+
+    def __init__(self, relative: bool) -> None:
+        self.apart, self.size, self.relative = 0.0, 1.0, relative
 
     def see(self, ours: NDArray[Any], theirs: NDArray[Any]) -> None:
         """Take a batch into account."""
         apart = np.abs(ours - theirs)
+        if self.relative:
+            with np.errstate(divide="ignore", invalid="ignore"):
+                apart = np.where(apart == 0, 0.0, apart / np.abs(ours))
+        else:
+            self.size = max(self.size, float(np.abs(ours).max()))
         self.apart = max(self.apart, float(np.where(np.isnan(apart), np.inf, apart).max()))
-        self.size = max(self.size, float(np.abs(ours).max()))
 
     @property
     def difference(self) -> float:

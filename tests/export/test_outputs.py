@@ -240,16 +240,46 @@ def test_differences_of_further_outputs_by_hand():
         )  # fmt: skip
 
     sizes = {"value": 2, "std": 1}
-    found = apart(0, 1e-4, 1.5e-3, 4e-6)
-    assert found.further == pytest.approx({"value": 7.5e-6, "std": 4e-6})  # of 200, and of 1
+    found = apart(0, 1e-4, 1.5e-3, 4e-7)
+    assert found.further == pytest.approx({"value": 7.5e-6, "std": 4e-6})  # of 200, and of 0.1
     assert found.holds
     assert str(found) == (
         "largest difference 0.0e+00 on 3 random observations; largest difference of value 7.5e-06, "
         "std 4.0e-06"
     )
-    for differences in ((0, 0, 3e-3, 0), (0, 0, 0, 2e-5), (2e-5, 0, 0, 0), (0, np.nan, 0, 0)):
+    for differences in ((0, 0, 3e-3, 0), (0, 0, 0, 2e-6), (2e-5, 0, 0, 0), (0, np.nan, 0, 0)):
         assert not apart(*differences).holds
     assert apart(0, 0, 0, np.inf).further["std"] == np.inf
+
+
+def test_a_small_standard_deviation_is_no_0():
+    def model(observations):
+        return np.array([[0.5, 2e-6]] * len(observations))
+
+    for factor, difference in ((1.0, 0.0), (1 + 5e-6, 5e-6), (0.0, 1.0)):
+        found = compare(
+            model, lambda o, by=factor: model(o) * [1, by], None, np.zeros((3, 1)), False,
+            further={"std": 1},
+        )  # fmt: skip
+        assert found.further == pytest.approx({"std": difference})
+        assert found.holds == (difference < 1e-5)
+
+
+def test_large_values_of_random_observations_hide_no_difference_of_recorded_ones():
+    def model(observations):
+        return np.concatenate([0 * observations, observations], axis=1)
+
+    def apart(recorded, random):
+        return compare(
+            model, lambda o: model(o) + [0, 1e-3], recorded, random, False, further={"value": 1}
+        )
+
+    small, large = np.full((3, 1), 2.0), np.full((3, 1), 1e4)
+    assert apart(None, large).holds
+    assert apart(large, None).further == pytest.approx({"value": 1e-7})
+    for pair in ((small, large), (large, small)):
+        assert apart(*pair).further == pytest.approx({"value": 5e-4})
+        assert not apart(*pair).holds
 
 
 def test_a_main_function_can_sample(tmp_path):
