@@ -10,7 +10,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
-from sb3_sparse.analysis.evaluation import check_eval_env, episode_returns
+from sb3_sparse.analysis.evaluation import episode_returns
 from sb3_sparse.export.observations import count_of, raw_of
 from sb3_sparse.export.parity import Actor
 
@@ -49,15 +49,13 @@ def play_both(
     observation_space: spaces.Space[Any],
     action_space: spaces.Space[Any],
 ) -> Returns:
-    """Let both policies play 20 episodes.
+    """Let both policies play at least 20 episodes, equally many in each environment.
 
     :param own: the model
     :param env: environments with the model's wrappers
     :param observation_space: the model's
     :param action_space: the model's
-    :raises ConfigError: if the environments normalise rewards or learn their statistics
     """
-    check_eval_env(env)
     played = []
     for actor in (own, exported):
         player = _Player(actor, env, observation_space, action_space)

@@ -72,22 +72,9 @@ def record_observations(model: BaseAlgorithm, env: VecEnv, count: int) -> Observ
     :param env: an environment with the model's wrappers, normalised or not; its statistics do not
         change
     :param count: number of observations
-    :raises ConfigError: if the environment does not fit the model's observations or actions
+    :raises ConfigError: as :func:`check_spaces`
     """
-    if not _fits(env.observation_space, model.observation_space):
-        shown, taken = _described(env.observation_space, model.observation_space)
-        raise ConfigError(
-            f"the environment shows observations {shown}, the model takes {taken}; a "
-            "run's folder knows the wrappers and stacked frames that belong to it, a zip does not"
-        )
-    there, here = env.action_space, model.action_space
-    if type(there) is not type(here) or (
-        there.shape != here.shape if isinstance(here, spaces.Box) else there != here
-    ):
-        raise ConfigError(
-            f"the environment takes actions in {there}, the model chooses from {here}; give the "
-            "environment that it was trained in"
-        )
+    check_spaces(model, env)
     normalization = unwrap_vec_normalize(env)
     training = normalization is not None and normalization.training
     if normalization is not None:
@@ -106,6 +93,27 @@ def record_observations(model: BaseAlgorithm, env: VecEnv, count: int) -> Observ
         keys = model.observation_space.spaces
         return {key: np.concatenate([part[key] for part in found])[:count] for key in keys}
     return np.concatenate(found)[:count]
+
+
+def check_spaces(model: BaseAlgorithm, env: VecEnv) -> None:
+    """Reject an environment in which a model cannot act.
+
+    :raises ConfigError: if it does not fit the model's observations or actions
+    """
+    if not _fits(env.observation_space, model.observation_space):
+        shown, taken = _described(env.observation_space, model.observation_space)
+        raise ConfigError(
+            f"the environment shows observations {shown}, the model takes {taken}; a "
+            "run's folder knows the wrappers and stacked frames that belong to it, a zip does not"
+        )
+    there, here = env.action_space, model.action_space
+    if type(there) is not type(here) or (
+        there.shape != here.shape if isinstance(here, spaces.Box) else there != here
+    ):
+        raise ConfigError(
+            f"the environment takes actions in {there}, the model chooses from {here}; give the "
+            "environment that it was trained in"
+        )
 
 
 def raw_of(
@@ -153,7 +161,7 @@ def _raw(normalization: VecNormalize, seen: Observations) -> Observations:
 
 
 def check_recorded(observations: Observations, space: spaces.Space[Any]) -> None:
-    """Reject recorded observations that are not finite or do not have the policy's shape.
+    """Reject recorded observations that are none, not finite, or not of the policy's shape.
 
     :raises ConfigError: if they are not valid
     """
@@ -181,6 +189,10 @@ def _check_part(part: Any, space: spaces.Space[Any], what: str) -> None:
         raise ConfigError(
             f"{what} must have a row for each, of shape {space.shape} as the policy sees "
             f"it (images channels first), got {got}"
+        )
+    if not len(part):
+        raise ConfigError(
+            f"{what} are empty; give some (record_observations makes them), or leave them out"
         )
     if not np.isfinite(part).all():
         raise ConfigError(f"{what} must be finite; some are NaN or infinite")

@@ -11,6 +11,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from torch import nn
 
+from sb3_sparse.analysis.evaluation import check_eval_env
 from sb3_sparse.errors import ConfigError, MissingExtra, UnsupportedError
 from sb3_sparse.export.artifact import GRAPH_ARTIFACTS, dense_artifact
 from sb3_sparse.export.calibrate import integer_graph
@@ -23,6 +24,7 @@ from sb3_sparse.export.graph import Graph
 from sb3_sparse.export.observations import (
     Observations,
     check_recorded,
+    check_spaces,
     check_statistics,
     has_images,
     random_observations,
@@ -129,7 +131,8 @@ def export_policy(
         alone, for processors without a float unit, in ranges twice those of ``observations``. The
         check then compares with the rounded policy, and the report tells how actions change
     :param eval_env: for ``int8``: environments with the model's wrappers, in which the model and
-        the exported policy play 20 episodes each for the report
+        the exported policy play for the report: at least 20 episodes each, equally many in each
+        environment
     :param with_value: not for ``"dense"``: write an estimate of the return, too, as the output
         ``value``. It is V(s) of PPO, A2C and TRPO; of other algorithms Q(s, a) of the action:
         the mean over quantiles of QRDQN, over all critics' quantiles of TQC, else the minimum over
@@ -146,7 +149,8 @@ def export_policy(
     :raises ParityError: if the export does not act as the model: if continuous actions differ by
         more than 1e-5, relative to their size above 1 and to the range they are squashed into, or
         if any discrete action differs; or if further outputs differ by more than 1e-5, relative to
-        their largest size above 1
+        their largest size above 1 for recorded or for random observations, or ``std`` relative to
+        its own size
     """
     check_format(to)
     bits = check_int8(int8, to)
@@ -157,6 +161,9 @@ def export_policy(
         )
     if eval_env is not None and bits is None:
         raise ConfigError("eval_env shows what int8 does to the return; give int8, too")
+    if eval_env is not None:
+        check_eval_env(eval_env)
+        check_spaces(model, eval_env)
     check_outputs(to, with_value, stochastic, int8)
     given = model
     if is_sbx_model(given):

@@ -5,7 +5,7 @@ import subprocess
 import numpy as np
 import pytest
 import torch as th
-from export.tools import COMPILER, chain, compiles, linear, random_chain, relu
+from export.tools import COMPILER, Task, chain, compiles, linear, random_chain, relu
 from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -455,15 +455,27 @@ def test_returns_as_text():
     assert str(Returns((1.0, 3.0), (2.0, 2.0))).startswith("2.00 ± 1.00 by the model, 2.00 ± 0.00")
 
 
-def test_errors(tmp_path):
+def test_errors(monkeypatch, tmp_path):
+    monkeypatch.setenv("CC", "no-such-compiler")  # which nothing here gets as far as
     model = make("SAC")
     env = VecNormalize(DummyVecEnv([lambda: model.get_env().envs[0]]))
+    images = DummyVecEnv([TinyImages])
+    other = DummyVecEnv([lambda: Task(model.observation_space, spaces.Discrete(2))])
     for options, message in [
         (dict(int8="full"), "int8='full' takes the ranges .* recorded observations; give"),
         (dict(int8="half"), "unknown value of int8 'half'; allowed are weights, full"),
         (dict(int8="full", to="numpy"), "int8 is for to='c' only, got to='numpy'"),
         (dict(eval_env=env), "eval_env shows what int8 does to the return; give int8, too"),
         (dict(eval_env=env, int8=True), "the evaluation environment normalises rewards"),
+        (dict(eval_env=images, int8=True), r"environment shows observations of shape \(36, 36, 1"),
+        (dict(eval_env=other, int8=True), r"takes actions in Discrete\(2\), the model chooses"),
+        *[
+            (
+                dict(int8=int8, observations=np.zeros((0, 3))),
+                "recorded observations are empty; give",
+            )
+            for int8 in (False, True, "full")
+        ],
     ]:
         with pytest.raises(ConfigError, match=message):
             export_policy(model, tmp_path / "policy", **options)
