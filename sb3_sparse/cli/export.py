@@ -44,9 +44,10 @@ def export_command(
         str | None,
         typer.Option(
             "--int8",
-            help="C only: weights as 8-bit numbers with a scale for each row. --int8 full: linear "
-            "layers without floats, for processors without a float unit.",
-            metavar="[full]",
+            help="C only: weights as 8-bit numbers with a scale for each row (weights, also by "
+            "--int8 alone); or linear layers without floats, too, for processors without a float "
+            "unit (full).",
+            metavar="[weights|full]",
             show_default=False,
         ),
     ] = None,

@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING
 from sb3_sparse.lazy import lazily
 
 if TYPE_CHECKING:
-    from sb3_sparse.export.effect import Returns
     from sb3_sparse.export.formats import FORMATS
     from sb3_sparse.export.observations import record_observations
     from sb3_sparse.export.parity import Parity, ParityError
-    from sb3_sparse.export.write import ExportReport, export_policy
+    from sb3_sparse.export.report import ExportReport
+    from sb3_sparse.export.returns import Returns
+    from sb3_sparse.export.write import export_policy
 
 __all__ = [
     "FORMATS",

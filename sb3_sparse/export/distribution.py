@@ -17,36 +17,36 @@ from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN
 from torch import nn
 
 from sb3_sparse.errors import UnsupportedError
-from sb3_sparse.export.acted import Acted, module_of
 from sb3_sparse.export.graph import Output
 from sb3_sparse.export.nodes import Activation, Linear, Multiply
 from sb3_sparse.export.output_nodes import Constant
+from sb3_sparse.export.traced_policy import TracedPolicy, module_of
 
 GAUSSIAN = (DiagGaussianDistribution, StateDependentNoiseDistribution)
 WITH_LOGITS = (CategoricalDistribution, MultiCategoricalDistribution, BernoulliDistribution)
 
 
-def distribution_outputs(acted: Acted, shape: tuple[int, ...]) -> tuple[Output, ...]:
+def distribution_outputs(traced: TracedPolicy, shape: tuple[int, ...]) -> tuple[Output, ...]:
     """Return the outputs ``mean`` and ``std``, or ``logits``.
 
     :param shape: shape of an action
     :raises UnsupportedError: if the policy has no distribution, or one that is not known
     """
-    owner = owner_of(acted.policy, acted.declared.acting)
+    owner = owner_of(traced.policy, traced.declared.acting)
     distribution = getattr(owner, "action_dist", None)
     if isinstance(distribution, WITH_LOGITS):
-        logits = acted.tracer.shape_of(acted.result)
-        return (Output("logits", acted.result, logits, _meaning(distribution)),)
+        logits = traced.tracer.shape_of(traced.result)
+        return (Output("logits", traced.result, logits, _meaning(distribution)),)
     if isinstance(distribution, GAUSSIAN):
-        std = _std(acted, owner, distribution)
-        where = ", before the tanh" if acted.squashed != acted.result else ""
+        std = _std(traced, owner, distribution)
+        where = ", before the tanh" if traced.squashed != traced.result else ""
         return (
-            Output("mean", acted.result, shape, f"the mean of the Gaussian{where}"),
+            Output("mean", traced.result, shape, f"the mean of the Gaussian{where}"),
             Output("std", std, shape, f"the standard deviation of the Gaussian{where}"),
         )
     if distribution is None:
         raise UnsupportedError(
-            f"{type(acted.policy).__name__} has no distribution of actions: what it explores with "
+            f"{type(traced.policy).__name__} has no distribution of actions: what it explores with "
             "is no part of the policy. Leave out stochastic (--stochastic), which is for PPO, "
             "A2C, TRPO, SAC, TQC and CrossQ"
         )
@@ -73,21 +73,23 @@ def _meaning(distribution: Any) -> str:
     return f"the logits of the choices, for a softmax each of {sizes}"
 
 
-def _std(acted: Acted, owner: Any, distribution: Any) -> int:
+def _std(traced: TracedPolicy, owner: Any, distribution: Any) -> int:
     """Append the operations that compute the standard deviation of each action."""
-    tracer, log_std = acted.tracer, owner.log_std
-    units = tracer.shape_of(acted.result)
+    tracer, log_std = traced.tracer, owner.log_std
+    units = tracer.shape_of(traced.result)
     if isinstance(distribution, StateDependentNoiseDistribution):
         # The sum of the features, each with its own Gaussian factor. Source: arXiv:2005.05719.
         with th.no_grad():
             variances = distribution.get_std(log_std).double().square().T
         weight = variances.expand(units[0], -1).cpu().numpy().astype(np.float32)
-        square = tracer.add(Multiply((acted.latent, acted.latent), tracer.shape_of(acted.latent)))
+        square = tracer.add(
+            Multiply((traced.latent, traced.latent), tracer.shape_of(traced.latent))
+        )
         bias = np.full(units, distribution.epsilon, np.float32)
         variance = tracer.add(Linear((square,), units, weight, bias))
         return tracer.add(Activation((variance,), units, "sqrt"))
     if isinstance(log_std, nn.Module):
-        value = tracer.walk(log_std, acted.latent)
+        value = tracer.walk(log_std, traced.latent)
         value = tracer.walk(nn.Hardtanh(float(LOG_STD_MIN), float(LOG_STD_MAX)), value)
         return tracer.add(Activation((value,), units, "exp"))
     numbers = log_std.detach().exp().cpu().numpy().astype(np.float32)

@@ -14,13 +14,13 @@ from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
 from sb3_sparse.errors import UnsupportedError
-from sb3_sparse.export.acted import Acted, module_of
 from sb3_sparse.export.distribution import distribution_outputs
 from sb3_sparse.export.estimate import mean_quantiles, value_output
 from sb3_sparse.export.graph import Graph, Output
 from sb3_sparse.export.nodes import Affine, Argmax, Clip, Positive
 from sb3_sparse.export.preprocess import observed, preprocessed
 from sb3_sparse.export.trace import Tracer
+from sb3_sparse.export.traced_policy import TracedPolicy, module_of
 from sb3_sparse.loading.zips import check_finite
 from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.policies.registry import sparse_counterpart, supported_algorithms
@@ -60,12 +60,12 @@ def graph_of(
         squashed = tracer.walk(nn.Tanh(), result)
     action = _action(tracer, squashed, policy, model.action_space)
     shape = tuple(model.action_space.shape or ())
-    acted = Acted(policy, sparse, tracer, value, features, latent, result, squashed)
+    traced = TracedPolicy(policy, sparse, tracer, value, features, latent, result, squashed)
     outputs = [Output("action", action, shape)]
     if with_value:
-        outputs.append(value_output(acted))
+        outputs.append(value_output(traced))
     if stochastic:
-        outputs += distribution_outputs(acted, shape)
+        outputs += distribution_outputs(traced, shape)
     chosen = tuple(outputs) if len(outputs) > 1 else ()
     return Graph(seen.shape, tracer.finish(), shape, seen.pixels, seen.parts, chosen)
 

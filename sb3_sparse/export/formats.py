@@ -43,8 +43,8 @@ def check_outputs(to: str, with_value: bool, stochastic: bool, int8: object = Fa
     asked = "with_value" if with_value else "stochastic"
     if int8 == "full":
         raise ConfigError(
-            f"{asked} has no whole numbers, got int8='full'; give int8='weights' (--int8 weights), "
-            "or leave one of them out"
+            f"int8='full' is for the action alone, so it cannot be combined with {asked}; give "
+            "int8='weights' (--int8 weights), or leave one of them out"
         )
     if to == "dense":
         raise ConfigError(

@@ -43,9 +43,9 @@ def write_onnx(graph: Graph, version: str) -> bytes:
 
     Further outputs are named, too: ``value``, ``mean``, ``std`` and ``logits``, all float32.
 
-    Both are batched. A dict observation has an input for each key, named after the key. Images are
-    uint8, other observations float32; actions are float32, or int64 if they are whole numbers.
-    Weights are dense, since ONNX runtimes have no sparse products.
+    Inputs and outputs are batched. A dict observation has an input for each key, named after the
+    key. Images are uint8, other observations float32; actions are float32, or int64 if they are
+    whole numbers. Weights are dense, since ONNX runtimes have no sparse products.
 
     :param version: version of this package, which the model names as its producer
     """

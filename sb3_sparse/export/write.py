@@ -2,102 +2,28 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
-from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
-from torch import nn
 
 from sb3_sparse.analysis.evaluation import check_eval_env
-from sb3_sparse.errors import ConfigError, MissingExtra, UnsupportedError
-from sb3_sparse.export.artifact import GRAPH_ARTIFACTS, dense_artifact
-from sb3_sparse.export.calibrate import integer_graph
-from sb3_sparse.export.effect import Returns, play_both
-from sb3_sparse.export.extract import check_model, graph_of, span_of
-from sb3_sparse.export.failure import failure_of
-from sb3_sparse.export.fold import fold
+from sb3_sparse.errors import ConfigError
+from sb3_sparse.export.check import check
+from sb3_sparse.export.extract import check_model, graph_of
 from sb3_sparse.export.formats import check_format, check_int8, check_outputs
-from sb3_sparse.export.graph import Graph
 from sb3_sparse.export.observations import (
     Observations,
     check_recorded,
     check_spaces,
     check_statistics,
-    has_images,
-    random_observations,
 )
-from sb3_sparse.export.parity import Parity, ParityError, compare
-from sb3_sparse.export.quantize import quantized
-from sb3_sparse.export.reference import predictor, rounded
-from sb3_sparse.export.sbx import NOT_CARRIED, as_sb3, is_sbx_model
-from sb3_sparse.export.units import remove_dead_units, units_of
+from sb3_sparse.export.report import ExportReport
+from sb3_sparse.export.returns import play_both
+from sb3_sparse.export.sbx_model import as_sb3, is_sbx_model
+from sb3_sparse.export.written import of_graph, of_model
 from sb3_sparse.loading.statistics import read_statistics
-from sb3_sparse.policies.compiled import unwrapped
 from sb3_sparse.policies.saving import was_normalised
-
-RANDOM = 1000
-RANDOM_IMAGES = 100
-
-
-@dataclass(frozen=True)
-class ExportReport:
-    """The outcome of an export.
-
-    :param files: the files and their sizes in bytes
-    :param parity: how closely the export acts as the model; None: not checked
-    :param rounding: how much 8-bit numbers change the actions; None: there are none
-    :param returns: what they do to the return; None: not played
-    :param sizes: bytes needed where the policy runs, by kind (``"flash"``, ``"RAM"``)
-    :param notes: what the user must know
-    :param nnz: connections of the exported networks that are not 0; for ``"dense"``, of all
-        networks
-    :param exported_nnz: those left once dead units are removed
-    :param dense_bytes: float32 weights and biases of these networks if they were dense; 0 for
-        ``"dense"``, as the counts of units
-    :param removed_units: number of dead units
-    :param units: number of units before
-
-    Example::
-
-        from stable_baselines3 import PPO
-        from sb3_sparse.export import export_policy
-
-        model = PPO("SparsePolicy", "CartPole-v1", policy_kwargs=dict(sparsity=0.9))
-        print(export_policy(model, "policy", to="numpy"))
-    """
-
-    files: dict[Path, int]
-    parity: Parity | None
-    rounding: Parity | None
-    sizes: dict[str, int]
-    notes: tuple[str, ...]
-    nnz: int
-    exported_nnz: int
-    dense_bytes: int = 0
-    removed_units: int = 0
-    units: int = 0
-    returns: Returns | None = None
-
-    def __str__(self) -> str:
-        lines = [f"{path}: {size:,} bytes" for path, size in self.files.items()]
-        lines += [f"{kind}: {size:,} bytes" for kind, size in self.sizes.items()]
-        if self.dense_bytes:
-            lines.append(f"float32 weights of the dense network: {self.dense_bytes:,} bytes")
-            lines.append(
-                f"connections: {self.nnz:,}, exported {self.exported_nnz:,}; "
-                f"{self.removed_units} of {self.units} units were dead and are left out"
-            )
-        else:
-            lines.append(f"connections that are not 0: {self.nnz:,}")
-        lines.append(f"parity: {'not checked' if self.parity is None else self.parity}")
-        if self.rounding is not None:
-            lines.append(f"int8 against float32: {self.rounding}")
-        if self.returns is not None:
-            lines.append(f"return: {self.returns}")
-        return "\n".join([*lines, *(f"note: {note}" for note in self.notes)])
 
 
 def export_policy(
@@ -169,70 +95,30 @@ def export_policy(
     if is_sbx_model(given):
         model = as_sb3(given, whole=to == "dense" or with_value)
     check_model(model)
-    space = model.observation_space
     normalization = normalization_of(given, vecnormalize)
     if observations is not None:
-        check_recorded(observations, space)
+        check_recorded(observations, model.observation_space)
     if to == "dense":
-        artifact = dense_artifact(model, normalization is not None)
-        normalization = written = twin = None  # a zip of SB3 does not normalise by itself
-        nnz = _connections(model)
-        counts = {"nnz": nnz, "exported_nnz": nnz}
-        further = {}
+        written = of_model(model, normalization, carried=model is not given)
     else:
         if normalization is not None:
-            check_statistics(space, normalization)
+            check_statistics(model.observation_space, normalization)
         raw = graph_of(model, normalization, with_value, stochastic)
-        exact = remove_dead_units(fold(raw))
-        written = integer_graph(exact, observations) if bits == "full" else exact
-        artifact = GRAPH_ARTIFACTS[to](written, bits is not None)
-        twin = quantized(written) if bits else None
-        counts = _counts(raw, exact)
-        _, *others = exact.sizes.items()
-        further = dict(others)
-    path = main_file(Path(path), next(iter(artifact.files)))
-    checked = partial(
-        compare,
-        discrete=not isinstance(model.action_space, spaces.Box),
-        span=span_of(model),
-        further=further,
-    )
-    count = RANDOM_IMAGES if has_images(space) else RANDOM
-    random = random_observations(space, normalization, count)
-    own = predictor(given, normalization, list(further), unwrapped(model.policy))
-    notes = list(artifact.notes)
-    if to == "dense" and model is not given:
-        notes.append(NOT_CARRIED)
-    parity = rounding = returns = None
-    try:
-        actor = artifact.actor()
-    except (UnsupportedError, MissingExtra) as error:
-        if not force:
-            raise
-        notes.append(f"written unchecked, as you asked: {error}")
-    else:
-        parity = checked(own if twin is None else rounded(twin, actor), actor, observations, random)
-        if twin is not None:  # whole numbers have the ranges of recorded observations
-            met = None if bits == "full" else random
-            rounding = checked(own, actor, observations, met)
-    if parity is not None and not parity.holds:
-        failure = failure_of(parity, written)
-        if not force:
-            raise ParityError(
-                f"the export to {to!r} does not act as the model: {failure}. Nothing was written; "
-                "--force (force=True) writes it all the same"
-            )
-        notes.append(f"written although it does not act as the model, as you asked: {failure}")
-    if eval_env is not None and rounding is not None:
-        returns = play_both(own, actor, eval_env, space, model.action_space)
+        written = of_graph(raw, to, bits, normalization, observations)
+    path = main_file(Path(path), next(iter(written.artifact.files)))
+    checked = check(written, given, model, observations, force)
+    returns = None
+    if eval_env is not None and checked.actor is not None:
+        space, action_space = model.observation_space, model.action_space
+        returns = play_both(checked.own, checked.actor, eval_env, space, action_space)
     return ExportReport(
-        files=artifact.write(path),
-        parity=parity,
-        rounding=rounding,
+        files=written.artifact.write(path),
+        parity=checked.parity,
+        rounding=checked.rounding,
         returns=returns,
-        sizes=artifact.sizes,
-        notes=tuple(notes),
-        **counts,
+        sizes=written.artifact.sizes,
+        notes=(*written.artifact.notes, *checked.notes),
+        **written.counts,
     )
 
 
@@ -256,27 +142,6 @@ def normalization_of(
     elif not isinstance(given, VecNormalize):
         raise ConfigError(f"vecnormalize must be a VecNormalize or its file, got {given!r}")
     return given if given is not None and given.norm_obs else None
-
-
-def _counts(raw: Graph, exact: Graph) -> dict[str, int]:
-    """Count what a graph had, and what it has without dead units."""
-    return {
-        "dense_bytes": sum(4 * (layer.weight.size + layer.bias.size) for layer in raw.layers),
-        "nnz": raw.nnz,
-        "exported_nnz": exact.nnz,
-        "removed_units": units_of(raw) - units_of(exact),
-        "units": units_of(raw),
-    }
-
-
-def _connections(model: BaseAlgorithm) -> int:
-    """Count the connections that are not 0, without targets and with shared layers once."""
-    layers = [
-        module
-        for name, module in unwrapped(model.policy).named_modules()
-        if isinstance(module, (nn.Linear, nn.Conv2d)) and "target" not in name
-    ]
-    return sum(int(layer.weight.count_nonzero()) for layer in layers)
 
 
 def main_file(path: Path, suffix: str) -> Path:

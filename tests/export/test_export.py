@@ -27,7 +27,12 @@ from sb3_sparse.errors import (
 from sb3_sparse.export import FORMATS, ParityError, export_policy, record_observations
 from sb3_sparse.export.compiler import compiled
 from sb3_sparse.export.extract import graph_of
-from sb3_sparse.export.parity import compare
+from sb3_sparse.export.failure import failure_of
+from sb3_sparse.export.fold import fold
+from sb3_sparse.export.parity import Parity, compare
+from sb3_sparse.export.quantize import quantized
+from sb3_sparse.export.units import remove_dead_units
+from sb3_sparse.export.written import of_graph
 
 TORQUE = spaces.Box(-1, 1, (1,), np.float32)
 
@@ -190,14 +195,14 @@ def test_where_files_go(model, tmp_path):
 
 def broken(monkeypatch):
     """Exports whose last bias is wrong."""
-    from sb3_sparse.export import write
+    from sb3_sparse.export import written
 
     def wrong(graph):
         layer = graph.layers[-1]
         layer.bias[0] += 0.25
         return graph
 
-    monkeypatch.setattr(write, "remove_dead_units", wrong)
+    monkeypatch.setattr(written, "remove_dead_units", wrong)
 
 
 @pytest.mark.parametrize("to", ["c", "numpy", "onnx"])
@@ -217,6 +222,22 @@ def test_a_discrete_action_that_differs_is_told_with_the_gap_of_the_scores(monke
     model = make("PPO", "CartPole-v1")
     with pytest.raises(ParityError, match=r"actions differ for \d+ of 1000.*are .* apart in score"):
         export_policy(model, tmp_path / "policy")
+
+
+def test_scores_that_are_told_are_those_of_rounded_weights():
+    raw = graph_of(make("PPO", "CartPole-v1"), None)
+    many = np.random.default_rng(0).normal(size=(100, 4)).astype(np.float32)
+    scores = raw.values(many)[raw.action.inputs[0]]
+    seen = many[[np.abs(scores[0] - scores[1]).argmin()]]
+    said = {}
+    for int8 in (None, "weights"):
+        graph = of_graph(raw, "c", int8, None, None).graph
+        text = failure_of(Parity(0, 1, 1.0, 1, True, seen), graph)
+        said[int8] = float(text.removesuffix(" apart in score").rpartition(" ")[2])
+    for int8, graph in ((None, raw), ("weights", quantized(remove_dead_units(fold(raw))))):
+        left, right = graph.values(seen)[graph.action.inputs[0]][:, 0]
+        assert said[int8] == float(f"{abs(left - right):.1e}")
+    assert said["weights"] != said[None]
 
 
 def test_parity_by_hand():

@@ -17,7 +17,6 @@ from sb3_sparse.export import Returns, export_policy, record_observations
 from sb3_sparse.export.c import write_c
 from sb3_sparse.export.calibrate import integer_graph
 from sb3_sparse.export.compiler import OPTIONS, compiled
-from sb3_sparse.export.effect import play_both
 from sb3_sparse.export.extract import graph_of
 from sb3_sparse.export.fold import fold
 from sb3_sparse.export.graph import Graph
@@ -26,6 +25,7 @@ from sb3_sparse.export.integers import Dequantized, Lookup, Quantize, Requantize
 from sb3_sparse.export.nodes import Activation, Add, Clip, Conv, Flatten, Standardize
 from sb3_sparse.export.quantize import quantized
 from sb3_sparse.export.reference import predictor, rounded
+from sb3_sparse.export.returns import play_both
 from sb3_sparse.export.units import remove_dead_units
 
 MAIN = """

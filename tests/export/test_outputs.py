@@ -192,7 +192,9 @@ def test_a_dense_zip_has_them_already(flag, tmp_path):
 @pytest.mark.parametrize("flag", ["with_value", "stochastic"])
 def test_whole_numbers_are_for_the_action_alone(flag, tmp_path):
     model = make("PPO")
-    with pytest.raises(ConfigError, match=f"{flag} has no whole numbers.*give int8='weights'"):
+    with pytest.raises(
+        ConfigError, match=f"full' is for the action alone, .* with {flag}; give int8='weights'"
+    ):
         export_policy(
             model, tmp_path / "policy", int8="full", observations=np.zeros((9, 3)), **{flag: True}
         )  # fmt: skip

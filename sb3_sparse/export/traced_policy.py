@@ -14,7 +14,7 @@ from sb3_sparse.policies.base import BaseSparsePolicy
 
 
 @dataclass(frozen=True)
-class Acted:
+class TracedPolicy:
     """A policy whose actions are traced.
 
     :param policy: sparse or stock
