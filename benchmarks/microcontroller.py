@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import argparse
 import csv
-import re
 import subprocess
 import sys
 import tempfile
@@ -32,7 +31,7 @@ from sb3_sparse.export import export_policy
 
 EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "microcontroller"
 sys.path.insert(0, str(EXAMPLE))
-from record import header, read  # noqa: E402
+from record import UNCOUNTED, header, read, sections  # noqa: E402
 
 SIZES = ("17-64-64-6", "17-256-256-6")
 SPARSITIES = (0, 80, 90, 95, 99)
@@ -123,11 +122,10 @@ def measure(folder: Path, board: str, options: str, expected: np.ndarray, within
     done = subprocess.run(command, check=True, capture_output=True, text=True)
     actions, ticks, stack = read(done.stdout)
     np.testing.assert_allclose(actions, expected, atol=within)
-    text = (build / "firmware.map").read_text()
-    text = text[text.index("Linker script and memory map") :]
-    found = re.findall(r"^ (\.\S+)\s+0x[0-9a-f]+\s+0x([0-9a-f]+)\s+\S*policy\.o$", text, re.M)
-    ram = sum(int(size, 16) for name, size in found if name.startswith((".bss", ".data")))
-    flash = sum(int(size, 16) for name, size in found if name.startswith((".text", ".rodata")))
+    assert (ticks != UNCOUNTED).all()
+    found = sections((build / "firmware.map").read_text())
+    ram = sum(size for name, size in found.items() if name.startswith((".bss", ".data")))
+    flash = sum(size for name, size in found.items() if name.startswith((".text", ".rodata")))
     return {
         "instructions": round(float(ticks.mean()) / each),
         "flash": flash,

@@ -37,3 +37,8 @@ uint32_t ticks(void)
 {
     return SYSTICK[2];
 }
+
+int ran_out(void)
+{
+    return (SYSTICK[0] >> 16) & 1u; /* COUNTFLAG, which start_ticks() has cleared */
+}

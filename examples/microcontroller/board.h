@@ -19,4 +19,7 @@ void start_ticks(void);
 /* The timer's value. */
 uint32_t ticks(void);
 
+/* Whether the timer has reached 0 since start_ticks(), after 2^24 - 1 ticks. */
+int ran_out(void);
+
 #endif

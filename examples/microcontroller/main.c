@@ -1,6 +1,7 @@
 /*
  * Steps the policy on recorded observations. For each it prints the action, the bits of its floats
- * in hexadecimal, and the ticks of the timer that it took; at the end the most bytes of stack.
+ * in hexadecimal, and the ticks of the timer that it took, or ffffffff for more than it can count;
+ * at the end the most bytes of stack.
  */
 #include <stdint.h>
 
@@ -8,6 +9,23 @@
 
 #include <observations.h> /* of the folder IN, whatever lies beside this file */
 #include <policy.h>
+
+/* What --with-value and --stochastic add; it is computed, and not printed. */
+#ifdef SB3_SPARSE_VALUE_SIZE
+static float value[SB3_SPARSE_VALUE_SIZE];
+#define VALUE , value
+#else
+#define VALUE
+#endif
+#ifdef SB3_SPARSE_MEAN_SIZE
+static float mean[SB3_SPARSE_MEAN_SIZE], std[SB3_SPARSE_STD_SIZE];
+#define DISTRIBUTION , mean, std
+#elif defined SB3_SPARSE_LOGITS_SIZE
+static float logits[SB3_SPARSE_LOGITS_SIZE];
+#define DISTRIBUTION , logits
+#else
+#define DISTRIBUTION
+#endif
 
 #define PAINT 0x5AFEC0DEu
 #define PAINTED 512 /* words of stack that are watched */
@@ -42,13 +60,15 @@ int main(void)
     uint32_t *word, *top = stack_pointer();
     uint32_t i, j, start, spent, used, most = 0;
 
-    start_ticks();
     for (i = 0; i < OBSERVATIONS; i++) {
         for (word = top - PAINTED; word < top; word++)
             *word = PAINT;
+        start_ticks();
         start = ticks();
-        sb3_sparse_policy(observations[i], action);
+        sb3_sparse_policy(observations[i], action VALUE DISTRIBUTION);
         spent = (start - ticks()) & 0xFFFFFFu;
+        if (ran_out())
+            spent = 0xFFFFFFFFu;
         for (word = top - PAINTED; word < top && *word == PAINT; word++)
             ;
         used = (uint32_t)(top - word) * 4u;

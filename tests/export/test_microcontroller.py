@@ -45,7 +45,7 @@ needs_board = pytest.mark.skipif(
     "libnewlib-arm-none-eabi qemu-system-arm make",
 )
 sys.path.insert(0, str(EXAMPLE))
-from record import header, read  # noqa: E402
+from record import UNCOUNTED, compare, header, read, record, sections  # noqa: E402
 
 
 @dataclass
@@ -74,14 +74,6 @@ def run_on(board, folder, observations):
     (folder / "observations.h").write_text(header(observations))
     actions, ticks, stack = read(built("run", board, folder))
     return Said(actions, ticks, stack, folder / board)
-
-
-def sections(build):
-    """Bytes of each section of policy.o in the map of what was linked."""
-    text = (build / "firmware.map").read_text()
-    text = text[text.index("Linker script and memory map") :]  # before: what was left out
-    found = re.findall(r"^ (\.\S+)\s+0x[0-9a-f]+\s+0x([0-9a-f]+)\s+\S*policy\.o$", text, re.M)
-    return {name: int(size, 16) for name, size in found}
 
 
 MODELS = {
@@ -156,7 +148,8 @@ def test_whole_numbers_are_the_same_on_every_board(board, tmp_path):
     (tmp_path / "policy.h").write_text(written.header)
     said = run_on(board, tmp_path, 3 * observations)
     np.testing.assert_array_equal(said.actions, whole.run(3 * observations))
-    static = [size for name, size in sections(said.build).items() if name.startswith(".bss")]
+    found = sections((said.build / "firmware.map").read_text())
+    static = [size for name, size in found.items() if name.startswith(".bss")]
     assert sum(static) == written.ram
     assert said.stack < STACK
 
@@ -182,20 +175,33 @@ def test_whole_numbers_need_an_eighth_of_the_instructions_without_a_float_unit(t
 
 @needs_board
 @pytest.mark.parametrize("board", BOARDS)
-@pytest.mark.parametrize("int8", [False, True])
-@pytest.mark.parametrize("kind", ["vectors", "images", "simba"])
-def test_flash_ram_and_stack_are_as_stated(kind, int8, board, tmp_path):
+@pytest.mark.parametrize(
+    ("kind", "options"),
+    [
+        *[
+            (kind, {"int8": int8})
+            for kind in ("vectors", "images", "simba")
+            for int8 in (False, True, "full")
+        ],
+        ("vectors", {"with_value": True, "stochastic": True}),
+        ("choices", {"with_value": True, "stochastic": True}),
+    ],
+    ids=str,
+)
+def test_flash_ram_and_stack_are_as_stated(kind, options, board, tmp_path):
     """Those in the map of what was linked, and the stack that was written to."""
     models = {
         "vectors": MODELS["SAC"],
         "images": lambda: make("DQN", TinyImages()),
         "simba": lambda: make("SAC", policy="SparseSimbaPolicy"),
+        "choices": lambda: make("PPO", "CartPole-v1"),
     }
     model = models[kind]()
-    report = export_policy(model, tmp_path / "policy", "c", int8=int8)
-    said = run_on(board, tmp_path, random_observations(model.observation_space, None, 5))
+    seen = random_observations(model.observation_space, None, 20)
+    report = export_policy(model, tmp_path / "policy", "c", observations=seen, **options)
+    said = run_on(board, tmp_path, seen[:5])
     source = (tmp_path / "policy.c").read_text()
-    found = sections(said.build)
+    found = sections((said.build / "firmware.map").read_text())
 
     static = [size for name, size in found.items() if name.startswith((".bss", ".data"))]
     assert sum(static) == report.sizes["RAM"]
@@ -217,6 +223,42 @@ def test_flash_ram_and_stack_are_as_stated(kind, int8, board, tmp_path):
     own = {frame.split("\t")[0].split(":")[-1]: int(frame.split("\t")[1]) for frame in frames}
     callee = max((size for name, size in own.items() if name != "sb3_sparse_policy"), default=0)
     assert said.stack + 8 >= own["sb3_sparse_policy"] + callee  # frames end in unused words
+
+
+SLOW = """
+void sb3_sparse_policy(const float *obs, float *action);
+void sb3_sparse_policy(const float *obs, float *action)
+{
+    unsigned long turns = (unsigned long)*obs;
+    while (turns--)
+        __asm__ volatile("nop");
+    *action = *obs;
+}
+"""
+
+
+@needs_board
+@pytest.mark.parametrize("board", BOARDS)
+def test_more_ticks_than_the_timer_counts_are_no_few_ticks(board, tmp_path, capsys):
+    (tmp_path / "policy.h").write_text(
+        "#define SB3_SPARSE_ACTION_SIZE 1\nvoid sb3_sparse_policy(const float *, float *);\n"
+    )
+    (tmp_path / "policy.c").write_text(SLOW)
+    turns = np.float32([[10], [9e6], [1000]])  # 3 instructions a turn, 16.4 million ticks at most
+    said = run_on(board, tmp_path, turns)
+    assert said.ticks[1] == UNCOUNTED
+    assert said.ticks[0] < 200
+    assert 3000 < said.ticks[2] < 8000
+    np.save(tmp_path / "actions.npy", turns)
+    compare(built("run", board, tmp_path), tmp_path, 1e-5)
+    assert "more ticks an action than the 16,777,215 that" in capsys.readouterr().out
+
+
+def test_dicts_are_not_recorded(tmp_path, monkeypatch):
+    make("PPO", "TinyDicts-v0").save(tmp_path / "model.zip")
+    with pytest.raises(SystemExit, match="has dicts as observations, and this example writes"):
+        record(tmp_path / "model.zip", 5, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["model.zip"]
 
 
 @needs_board
@@ -306,6 +348,25 @@ def test_the_arduino_sketch_compiles_by_the_flags_of_a_cortex_m0_board(tmp_path)
     compile_for_arm("g++", [*common, *plus], [*include, *first], sketch, tmp_path)
     compile_for_arm("gcc", [*common, "-std=gnu11"], [], tmp_path / "policy.c", tmp_path)
     assert "sb3_sparse_policy" in undefined(tmp_path / "policy_sketch.o")  # a C name
+
+
+@needs_compiler
+@pytest.mark.parametrize("asked", ["with_value", "stochastic"])
+def test_firmware_says_that_it_takes_the_action_alone(asked, tmp_path):
+    task = Task(spaces.Box(-1, 1, (13,), np.float32), spaces.Box(-1, 1, (4,), np.float32))
+    export_policy(make("SAC", task), tmp_path / "policy", "c", **{asked: True})
+    controller = EXAMPLE / "crazyflie" / "src" / "policy_controller.c"
+    sketch = EXAMPLE / "arduino" / "policy_sketch" / "policy_sketch.ino"
+    plus = ["-x", "c++", "-include", "Arduino.h"]
+    for stub, compiler, options, source in (
+        ("crazyflie", "gcc", [], controller),
+        ("arduino", "g++", plus, sketch),
+    ):
+        command = [f"arm-none-eabi-{compiler}", f"-I{STUBS / stub}", f"-I{tmp_path}", *options]
+        command += ["-c", str(source), "-o", "/dev/null"]
+        done = subprocess.run(command, capture_output=True, text=True)
+        assert done.returncode != 0
+        assert '"export policy.c without --with-value and --stochastic, or pass' in done.stderr
 
 
 def compile_for_arm(compiler, options, include, source, folder):

@@ -1,6 +1,11 @@
 // Steps a policy on the analog inputs and sets PWM outputs by it.
 #include "policy.h"  // has extern "C": the sketch is C++, policy.c stays C
 
+#if defined(SB3_SPARSE_VALUE_SIZE) || defined(SB3_SPARSE_MEAN_SIZE) || \
+    defined(SB3_SPARSE_LOGITS_SIZE)
+#error "export policy.c without --with-value and --stochastic, or pass an array for each output"
+#endif
+
 static const uint8_t INPUTS[] = {A0, A1, A2};
 static const uint8_t OUTPUTS[] = {9};
 

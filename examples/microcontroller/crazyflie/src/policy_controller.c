@@ -14,6 +14,11 @@
 #define DEBUG_MODULE "POLICY"
 #include "debug.h"
 
+#if defined(SB3_SPARSE_VALUE_SIZE) || defined(SB3_SPARSE_MEAN_SIZE) || \
+    defined(SB3_SPARSE_LOGITS_SIZE)
+#error "export policy.c without --with-value and --stochastic, or pass an array for each output"
+#endif
+
 _Static_assert(SB3_SPARSE_OBSERVATION_SIZE == 13, "position 3, attitude 4, velocity 3, rates 3");
 _Static_assert(SB3_SPARSE_ACTION_SIZE == 4, "a force for each motor");
 
