@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -80,6 +81,27 @@ gym.register("TinyDicts-v0", TinyDicts)
 
 ALGORITHMS = {cls.__name__: cls for cls in sb3_sparse.supported_algorithms().values()}
 DISCRETE = ("DQN", "QRDQN")
+
+
+def run_command(monkeypatch, capsys, *arguments) -> tuple[int, str, str]:
+    """Run ``sb3-sparse``; return its exit code, its output, and its errors."""
+    from sb3_sparse import cli
+
+    monkeypatch.setattr(sys, "argv", ["sb3-sparse", *map(str, arguments)])
+    monkeypatch.setenv("COLUMNS", "300")
+    code = 0
+    try:
+        cli.main()
+    except SystemExit as stop:
+        code = stop.code or 0
+    said = capsys.readouterr()
+    return code, said.out, said.err
+
+
+def command(monkeypatch, capsys, *arguments) -> tuple[int, str]:
+    """The same; return its exit code, and all that it says as one line."""
+    code, out, err = run_command(monkeypatch, capsys, *arguments)
+    return code, " ".join((out + err).split())
 
 
 def arguments_of(algorithm: type[BaseAlgorithm]) -> dict[str, object]:

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import pickle
 import shutil
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +9,8 @@ import pytest
 import torch as th
 from sb3_contrib import RecurrentPPO
 from stable_baselines3.common.save_util import load_from_zip_file, save_to_zip_file
-from support import make
+from support import command, make
 
-from sb3_sparse import cli
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.export.numpy_policy import Policy
 from sb3_sparse.zoo.saved import SavedModel
@@ -21,19 +19,6 @@ from sb3_sparse.zoo.spec import RunSpec
 from sb3_sparse.zoo.training import train
 
 QUICK = dict(n_timesteps=300, eval_freq=100, eval_episodes=2)
-
-
-def command(monkeypatch, capsys, *arguments):
-    """Exit code and output of ``sb3-sparse``."""
-    monkeypatch.setattr(sys, "argv", ["sb3-sparse", *map(str, arguments)])
-    monkeypatch.setenv("COLUMNS", "200")
-    code = 0
-    try:
-        cli.main()
-    except SystemExit as stop:
-        code = stop.code or 0
-    said = capsys.readouterr()
-    return code, " ".join((said.out + said.err).split())
 
 
 @pytest.fixture(scope="module")

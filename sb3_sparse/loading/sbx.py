@@ -16,7 +16,7 @@ from sb3_sparse.loading.guard import reading
 WHAT = "model saved by SBX"
 CURE = "give a model saved by SBX, or an earlier checkpoint"
 ROOMY = 2**34
-"""Bytes of attributes that no model reaches, but a damaged header may claim."""
+"""Bytes of a member that no model reaches, but a damaged header may claim."""
 ALGORITHMS = ("dqn", "sac", "td3", "ddpg", "ppo", "tqc", "crossq")
 NO_BUFFER: dict[str, Any] = {
     "buffer_size": 1,

@@ -15,13 +15,11 @@ from stable_baselines3.common.save_util import load_from_zip_file
 
 from sb3_sparse.errors import ConfigError, CorruptStateError, Diverged
 from sb3_sparse.loading.guard import reading
-from sb3_sparse.loading.sbx import is_sbx, unsupported
+from sb3_sparse.loading.sbx import ROOMY, is_sbx, unsupported
 
 WHAT = "model saved by SB3"
 CURE = "give a model saved by SB3, e.g. model.zip, or an earlier checkpoint"
 MASK = "_mask"
-ROOMY = 2**34
-"""Bytes of a member that no policy reaches, but a damaged header may claim."""
 
 
 @dataclass(frozen=True)

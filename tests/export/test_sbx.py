@@ -14,8 +14,8 @@ import yaml
 from gymnasium import spaces
 from stable_baselines3 import DQN, PPO, SAC, TD3
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from support import command
 
-from sb3_sparse import cli
 from sb3_sparse.errors import UnsupportedError
 from sb3_sparse.export import export_policy
 from sb3_sparse.export.numpy_policy import Policy
@@ -31,19 +31,6 @@ STOCK = {"sac": SAC, "td3": TD3, "ppo": PPO, "ppo_discrete": PPO, "dqn": DQN}
 def small(**further):
     """Arguments of a policy, new ones for each model, since SBX adds to them."""
     return dict(net_arch=[16, 24], **further)
-
-
-def command(monkeypatch, capsys, *arguments):
-    """Exit code and output of ``sb3-sparse``."""
-    monkeypatch.setattr(sys, "argv", ["sb3-sparse", *map(str, arguments)])
-    monkeypatch.setenv("COLUMNS", "200")
-    code = 0
-    try:
-        cli.main()
-    except SystemExit as stop:
-        code = stop.code or 0
-    said = capsys.readouterr()
-    return code, " ".join((said.out + said.err).split())
 
 
 def observations(model, count=40):

@@ -5,14 +5,13 @@ from __future__ import annotations
 import json
 import pickle
 import shutil
-import sys
 import zipfile
 
 import numpy as np
 import pytest
 import yaml
+from support import run_command
 
-from sb3_sparse import cli
 from sb3_sparse.report.reading import read_runs
 from sb3_sparse.zoo.spec import RunSpec
 from sb3_sparse.zoo.training import train
@@ -63,14 +62,8 @@ def said(monkeypatch, capsys, tmp_path):
         name, *rest = COMMANDS[command]
         arguments = [str(tmp_path / "out") if one == "OUT" else one for one in rest]
         where = [str(folder), *arguments] if name != "train" else [*arguments, str(folder)]
-        monkeypatch.setattr(sys, "argv", ["sb3-sparse", name, *where])
-        monkeypatch.setenv("COLUMNS", "200")
-        code = 0
-        try:
-            cli.main()
-        except SystemExit as stop:
-            code = stop.code or 0
-        return code, capsys.readouterr().err
+        code, _, errors = run_command(monkeypatch, capsys, name, *where)
+        return code, errors
 
     return call
 

@@ -8,9 +8,8 @@ import zipfile
 from pathlib import Path
 
 import pytest
-from support import make
+from support import make, run_command
 
-from sb3_sparse import cli
 from sb3_sparse.errors import CorruptStateError, UnsupportedError
 from sb3_sparse.loading.sbx import is_sbx, sbx_algorithms
 from sb3_sparse.loading.zips import look_into, read_model
@@ -105,10 +104,8 @@ def test_only_sb3_zips_are_read_as_such(zip_of):
 def test_commands_say_what_to_do(zip_of, command, message, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "sbx", None)  # as if it were not installed
     path = zip_of({"policy_class": written("sbx.sac.policies"), "n_envs": 1})
-    monkeypatch.setattr(sys, "argv", ["sb3-sparse", command[0], str(path), *command[1:]])
-    with pytest.raises(SystemExit) as ended:
-        cli.main()
-    assert ended.value.code == 2
-    (line,) = capsys.readouterr().err.strip().splitlines()
+    code, _, errors = run_command(monkeypatch, capsys, command[0], path, *command[1:])
+    assert code == 2
+    (line,) = errors.strip().splitlines()
     assert line.startswith("Error: ")
     assert message in line

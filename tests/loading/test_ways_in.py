@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import shutil
 import stat
-import sys
+from functools import partial
 
 import numpy as np
 import pytest
 import torch as th
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
-from support import make
+from support import make, run_command
 
-from sb3_sparse import cli, sparsify
+from sb3_sparse import sparsify
 from sb3_sparse.errors import ConfigError, CorruptStateError, Diverged
 from sb3_sparse.loading.statistics import load_statistics, read_statistics
 from sb3_sparse.loading.text import read_text
@@ -41,25 +41,17 @@ def folder(whole, tmp_path):
 
 
 @pytest.fixture
-def run_command(monkeypatch, capsys):
-    def call(*arguments):
-        monkeypatch.setattr(sys, "argv", ["sb3-sparse", *map(str, arguments)])
-        monkeypatch.setenv("COLUMNS", "300")
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-        said = capsys.readouterr()
-        return ended.value.code, said.out, said.err
-
-    return call
+def said(monkeypatch, capsys):
+    return partial(run_command, monkeypatch, capsys)
 
 
-def test_enjoy_plays_a_zip_alone_as_its_run(folder, tmp_path, run_command):
+def test_enjoy_plays_a_zip_alone_as_its_run(folder, tmp_path, said):
     in_run = enjoy(folder, 3)
     alone = shutil.copy(folder / f"{ENV}.zip", tmp_path / "alone.zip")
     statistics = shutil.copy(folder / ENV / "vecnormalize.pkl", tmp_path / "statistics.pkl")
     score = enjoy(alone, 3, env_id=ENV, vecnormalize=statistics)
     assert (score.mean_return, score.std_return) == (in_run.mean_return, in_run.std_return)
-    code, out, _ = run_command(
+    code, out, _ = said(
         "enjoy", alone.with_suffix(""), "-n", 1, "--env", ENV, "--vecnormalize", statistics
     )
     assert code == 0
@@ -169,17 +161,17 @@ def test_text_that_is_not_utf_8_is_refused_with_its_place(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["[red]x[/]", "[/]", "a [bold", "[link=x]y"])
-def test_markup_in_the_name_of_a_folder_is_printed_as_it_is(name, whole, tmp_path, run_command):
+def test_markup_in_the_name_of_a_folder_is_printed_as_it_is(name, whole, tmp_path, said):
     path = shutil.copytree(whole, tmp_path / name)  # [/] is a folder in one called [
-    code, out, err = run_command("enjoy", path, "-n", 1)
+    code, out, err = said("enjoy", path, "-n", 1)
     assert code == 0, err
     assert str(path / f"{ENV}.zip") in out
-    code, out, err = run_command("export", path, path / "policy", "--to", "numpy")
+    code, out, err = said("export", path, path / "policy", "--to", "numpy")
     assert code == 0, err
     assert str(path / "policy.npz") in out
-    code, _, err = run_command("inspect", path / "gone.zip")
+    code, _, err = said("inspect", path / "gone.zip")
     assert str(path / "gone.zip") in err
-    code, _, err = run_command(name)
+    code, _, err = said(name)
     assert code == 2
     assert f"No such command {name!r}" in err
 
@@ -210,7 +202,7 @@ def test_looking_at_a_run_writes_nothing_into_it(read_only):
     assert everything(read_only) == before
 
 
-def test_looking_at_a_study_writes_nothing(tmp_path, run_command):
+def test_looking_at_a_study_writes_nothing(tmp_path, said):
     study = tmp_path / "mine.yml"
     study.write_text(
         "title: mine\nfigures: [curves]\nruns: [{algo: dqn, env_id: CartPole-v1, method: static, "
@@ -219,23 +211,23 @@ def test_looking_at_a_study_writes_nothing(tmp_path, run_command):
     )
     store = tmp_path / "store"
     cell = Study.read(str(study), "small").cells[0]
-    code, out, _ = run_command("study", "status", study, "-f", store)
+    code, out, _ = said("study", "status", study, "-f", store)
     assert code == 0
     assert "1 waiting" in out
     assert not store.exists()
     train(cell.run, folder=cell.folder(store).path)
     (cell.folder(store).path / ".lock").touch()  # of a process that was killed
     before = everything(store)
-    code, out, _ = run_command("study", "status", study, "-f", store)
+    code, out, _ = said("study", "status", study, "-f", store)
     assert code == 0
     assert "1 done" in out
     assert everything(store) == before
     record = cell.folder(store).path / "sparsity.json"
     record.write_bytes(record.read_bytes()[:40])
-    code, out, _ = run_command("study", "status", study, "-f", store)
+    code, out, _ = said("study", "status", study, "-f", store)
     assert code == 0
     assert "1 failed" in out
     assert "sparsity.json is damaged" in out
-    code, out, err = run_command("study", "report", study, "-f", store, "-o", tmp_path / "page")
+    code, out, err = said("study", "report", study, "-f", store, "-o", tmp_path / "page")
     assert code == 0, err
     assert "sparsity.json is damaged" in (tmp_path / "page" / "index.html").read_text()
