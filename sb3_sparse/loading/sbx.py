@@ -62,17 +62,19 @@ def unsupported(path: Path) -> UnsupportedError:
     )
 
 
-def read_attributes(path: Path) -> dict[str, Any]:
+def read_attributes(path: Path, without_policy: bool = False) -> dict[str, Any]:
     """Read the attributes of a model of SBX, including its policy.
 
     This unpickles them, as SBX's ``load`` does, so the file must be trusted.
 
+    :param without_policy: put None in place of the policy, which is what takes long
     :raises MissingExtra: if SBX is not installed
     :raises CorruptStateError: if the file is damaged, or of versions that do not fit
     """
     _sbx()
     with reading(path, WHAT, CURE):
-        data, _, _ = load_from_zip_file(path, device="cpu")
+        instead = {"policy": None} if without_policy else None
+        data, _, _ = load_from_zip_file(path, custom_objects=instead, device="cpu")
     if not isinstance(data, dict) or "policy" not in data:  # of which SB3 only warns
         raise CorruptStateError(
             f"the policy in {path} cannot be unpickled: the file is damaged, or was saved with "
@@ -95,8 +97,9 @@ def load_sbx(path: Path, algo: str) -> BaseAlgorithm:
     attributes = read_attributes(path)
     sbx = _sbx()
     classes = {name.lower(): getattr(sbx, name) for name in sbx.__all__}
+    instead = {**attributes, **NO_BUFFER}  # so that SBX unpickles nothing again
     with reading(path, WHAT, CURE):
-        model: BaseAlgorithm = classes[algo].load(path, custom_objects=NO_BUFFER)
+        model: BaseAlgorithm = classes[algo].load(path, custom_objects=instead)
     for name in NO_BUFFER:
         if name in attributes:
             setattr(model, name, attributes[name])

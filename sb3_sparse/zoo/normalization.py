@@ -93,7 +93,7 @@ def _check_lone(path: Path, algo: str) -> None:
                 "observations of this model, else move it elsewhere"
             )
     if issubclass(algorithms()[algo], OnPolicyAlgorithm):
-        data = read_attributes(path) if is_sbx(path) else read_model(path)[0]
+        data = read_attributes(path, True) if is_sbx(path) else read_model(path)[0]
         if differ(*map(data.get, LAST_SEEN[:2])):
             raise ConfigError(
                 f"{path} was trained with VecNormalize; give its statistics with --vecnormalize "

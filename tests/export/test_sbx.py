@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import base64
+import json
 import pickle
 import sys
+import zipfile
 from pathlib import Path
 
 import gymnasium as gym
@@ -13,6 +16,7 @@ import torch as th
 import yaml
 from gymnasium import spaces
 from stable_baselines3 import DQN, PPO, SAC, TD3
+from stable_baselines3.common import save_util
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from support import command
 
@@ -20,6 +24,7 @@ from sb3_sparse.errors import UnsupportedError
 from sb3_sparse.export import export_policy
 from sb3_sparse.export.numpy_policy import Policy
 from sb3_sparse.loading.sbx import load_sbx
+from sb3_sparse.zoo.saved import SavedModel
 
 sbx = pytest.importorskip("sbx", reason="SBX is not installed: pip install 'sb3-sparse[sbx]'")
 import flax.linen as flax_nn  # noqa: E402
@@ -111,6 +116,25 @@ def test_the_command_line_takes_a_zip(zips, monkeypatch, capsys, tmp_path):
     )
     assert code == 0, said
     assert "1000 recorded and 1000 random observations" in said
+
+
+@pytest.mark.parametrize("name", ["ppo", "sac"])
+def test_a_policy_is_unpickled_once(zips, name, monkeypatch):
+    with zipfile.ZipFile(zips[name]) as archive:
+        policy = json.loads(archive.read("data"))["policy"][":serialized:"]
+    loads, times = save_util.cloudpickle.loads, []
+
+    def counted(content):
+        times.append(content == base64.b64decode(policy))
+        return loads(content)
+
+    monkeypatch.setattr(save_util.cloudpickle, "loads", counted)
+    model = SavedModel.find(zips[name], env_id="Pendulum-v1").load()
+    assert sum(times) == 1
+    expected = load_sbx(zips[name], name)
+    seen = observations(model)
+    acted = [one.predict(seen, deterministic=True)[0] for one in (model, expected)]
+    np.testing.assert_array_equal(*acted)
 
 
 def test_an_export_twice_gives_the_same_bytes(trained, tmp_path):
