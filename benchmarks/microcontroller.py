@@ -162,7 +162,7 @@ def cases(sizes: list[int], sparsities: list[int], emlearn: Path | None, folder:
             where = made(f"{name.replace(' ', '_')}{percent}")
             recorded = seen if int8 == "full" else None
             export_policy(model, where / "policy", "c", int8=int8, observations=recorded)
-            yield percent, name, where, "-O2", actions, 0.1 if int8 else 1e-5
+            yield percent, name, where, "-O2", actions, 0.02 if int8 else 1e-5
 
 
 def main() -> None:

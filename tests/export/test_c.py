@@ -151,7 +151,7 @@ def test_eight_bits_by_hand():
 def test_eight_bit_weights_act_as_the_rounded_weights_do(tmp_path):
     model = make("SAC", policy_kwargs={"sparsity": 0.5})
     report = export_policy(model, tmp_path / "policy", "c", int8=True)
-    assert report.parity.difference < 1e-5 < report.rounding.difference < 0.1
+    assert report.parity.difference < 1e-5 < report.rounding.difference < 0.02
     floats = export_policy(model, tmp_path / "floats", "c")
     assert report.sizes["flash"] < floats.sizes["flash"]
     graph = quantized(graph_of(model, None))

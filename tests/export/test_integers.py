@@ -224,7 +224,7 @@ def test_wide_layers_have_inputs_of_fewer_bits_so_that_no_sum_overflows():
     whole = integer_graph(graph, seen)
     check_bounds(whole)
     assert whole.nodes[1].multiplier.max() <= (2**30 - 1) // (127 * 3000) < 2**12
-    np.testing.assert_allclose(whole.run(seen), graph.run(seen), rtol=0.02)
+    np.testing.assert_allclose(whole.run(seen), graph.run(seen), rtol=0.001)
     widest = chain(66_000, (np.ones((1, 66_000)), [0]))  # 66,000 * 127 * 127 < 2^30
     check_bounds(integer_graph(widest, np.ones((2, 66_000))))
     with pytest.raises(UnsupportedError, match="may exceed 32 bits; export it with int8='weights'"):
@@ -265,7 +265,7 @@ def test_inputs_have_ranges_of_their_own():
     # Twice what was seen; the third never moved, so it gets what it showed, above the median.
     np.testing.assert_allclose(2 * 32767 / whole.nodes[0].twice, [2, 0.002, 14], rtol=1e-6)
     given = np.float32([[0.1, 0.0009, 7], [-0.7, 0.0003, 7]])
-    np.testing.assert_allclose(whole.run(given), graph.run(given), atol=0.1)
+    np.testing.assert_allclose(whole.run(given), graph.run(given), atol=0.02)
 
 
 @pytest.mark.parametrize(
@@ -286,11 +286,15 @@ def test_every_activation_is_a_table(kind, parameters):
     np.testing.assert_allclose(whole.run(x), graph.run(x), atol=0.004)
 
 
-def test_what_is_no_table_stays_a_float():
-    for middle in (Activation((1,), (1,), "threshold", {"most": 0.1, "instead": 0.0}),):
-        graph = Graph((1,), (linear(0, [[1]]), middle, linear(2, [[1]])), (1,))
-        kinds = [type(node) for node in integer_graph(graph, np.float32([[-1], [1]])).nodes]
-        assert kinds == [Quantize, Dequantized, Activation, Quantize, Dequantized]
+@pytest.mark.parametrize(
+    ("kind", "parameters"),
+    [("threshold", {"most": 0.1, "instead": 0.0}), ("hardshrink", {"most": 0.5})],
+)
+def test_what_is_no_table_stays_a_float(kind, parameters):
+    middle = Activation((1,), (1,), kind, parameters)
+    graph = Graph((1,), (linear(0, [[1]]), middle, linear(2, [[1]])), (1,))
+    kinds = [type(node) for node in integer_graph(graph, np.float32([[-1], [1]])).nodes]
+    assert kinds == [Quantize, Dequantized, Activation, Quantize, Dequantized]
 
 
 def test_a_residual_connection_and_a_norm_stay_floats():
@@ -303,7 +307,7 @@ def test_a_residual_connection_and_a_norm_stay_floats():
         *[Quantize, Dequantized, Quantize, Requantized, Dequantized, Add, Standardize],
         *[Quantize, Dequantized],
     ]
-    np.testing.assert_allclose(whole.run(seen), graph.run(seen), atol=0.05)
+    np.testing.assert_allclose(whole.run(seen), graph.run(seen), atol=0.015)
     act = compiled(write_c(whole, "0", True).source, whole)
     np.testing.assert_allclose(act(seen), whole.run(seen), atol=1e-6)
 
@@ -314,7 +318,7 @@ def test_rows_without_weights_and_with_large_biases():
     whole = integer_graph(graph, seen)
     check_bounds(whole)
     assert not whole.nodes[1].weight[:2].any()
-    np.testing.assert_allclose(whole.run(seen), graph.run(seen), atol=2 * 5000 / 127)
+    np.testing.assert_allclose(whole.run(seen), graph.run(seen), atol=0.5)
 
 
 @pytest.mark.parametrize("compute", ["masked", "sparse"])
@@ -328,9 +332,9 @@ def test_policies_of_every_kind_and_storage(algorithm, compute, tmp_path):
     assert report.parity.random == 1000
     assert (report.rounding.recorded, report.rounding.random) == (200, 0)
     if report.rounding.discrete:
-        assert report.rounding.different <= 10
+        assert report.rounding.different <= 1
     else:
-        assert 0 < report.rounding.difference < 0.1
+        assert 0 < report.rounding.difference < 0.01
     assert "int8 against float32: " in str(report)
     source = (tmp_path / "policy.c").read_text()
     tables = 2 * 257 * source.count("static const int16_t table_")
@@ -341,19 +345,19 @@ def test_policies_of_every_kind_and_storage(algorithm, compute, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "model",
+    ("model", "most"),
     [
-        lambda: make("PPO", TinyImages(False)),
-        lambda: make("SAC", policy="SparseSimbaPolicy", policy_kwargs={"sparsity": 0.5}),
+        (lambda: make("PPO", TinyImages(False)), 1e-4),
+        (lambda: make("SAC", policy="SparseSimbaPolicy", policy_kwargs={"sparsity": 0.5}), 0.03),
     ],
     ids=["images", "simba"],
 )
-def test_convolutions_and_norms_stay_floats(model, tmp_path):
+def test_convolutions_and_norms_stay_floats(model, most, tmp_path):
     model = model()
     seen = record_observations(model, model.get_env(), 50)
     report = export_policy(model, tmp_path / "policy", int8="full", observations=seen)
     assert report.parity.holds
-    assert report.rounding.difference < 0.1
+    assert report.rounding.difference < most
 
 
 @pytest.mark.parametrize("side", [36, 48])
@@ -437,7 +441,7 @@ def test_the_return_is_reported_and_normalised_observations_are_taken_raw(tmp_pa
     report = export_policy(model, tmp_path / "policy", **options)
     assert len(report.returns.float32) == len(report.returns.int8) == 20
     differences = np.subtract(report.returns.float32, report.returns.int8)
-    assert 0 < np.abs(differences).max() < 100  # the same pendulums, and almost the same torques
+    assert 0 < np.abs(differences).max() < 2  # the same pendulums, and almost the same torques
     assert np.std(report.returns.float32) > 100
     assert f"return: {report.returns}" in str(report)
 
@@ -495,8 +499,8 @@ def test_whole_numbers_add_little_to_the_rounding_of_weights():
     graph = random_chain(random, [17, 256, 256, 6], 0.05)
     seen = random.normal(size=(400, 17)).astype(np.float32)
     exact, whole = graph.run(seen), integer_graph(graph, seen).run(seen)
-    rounded = quantized(graph).run(seen)
-    assert np.abs(whole - exact).mean() < 1.2 * np.abs(rounded - exact).mean()
+    weights = quantized(graph).run(seen)
+    assert np.abs(whole - exact).mean() < 1.01 * np.abs(weights - exact).mean()
 
 
 def test_a_policy_with_a_tanh_between_needs_no_math_library(tmp_path):
