@@ -11,14 +11,17 @@ from export.test_c import check_memory
 from export.tools import COMPILER, Task
 from gymnasium import spaces
 from support import ALGORITHMS, DISCRETE, TinyDicts, TinyImages, make
+from torch import nn
 
 from sb3_sparse.errors import ConfigError, UnsupportedError
 from sb3_sparse.export import ParityError, export_policy
 from sb3_sparse.export.compiler import OPTIONS, compiled
+from sb3_sparse.export.estimate import mean_quantiles
 from sb3_sparse.export.extract import graph_of
 from sb3_sparse.export.fold import fold
 from sb3_sparse.export.numpy_policy import Policy
 from sb3_sparse.export.parity import compare
+from sb3_sparse.export.trace import Tracer
 
 WRITTEN = ("c", "numpy", "onnx")
 GAUSSIAN = ("PPO", "A2C", "TRPO", "SAC", "TQC", "CrossQ")
@@ -252,6 +255,13 @@ def test_differences_of_further_outputs_by_hand():
     for differences in ((0, 0, 3e-3, 0), (0, 0, 0, 2e-6), (2e-5, 0, 0, 0), (0, np.nan, 0, 0)):
         assert not apart(*differences).holds
     assert apart(0, 0, 0, np.inf).further["std"] == np.inf
+
+
+def test_quantiles_that_no_linear_layer_makes_are_an_error():
+    tracer = Tracer((6,), {})
+    value = tracer.walk(nn.ReLU(), 0)
+    with pytest.raises(UnsupportedError, match="does not end in a Linear layer.*; end it in one"):
+        mean_quantiles(tracer, value, 3)
 
 
 def test_a_small_standard_deviation_is_no_0():
