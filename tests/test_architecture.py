@@ -25,7 +25,8 @@ FLOORS = [
     {"engine"},
     {"topology"},
     {"sparsity"},
-    {"files", "intervals", "pages"},
+    {"pages"},
+    {"files", "intervals"},
     {"errors", "lazy"},
 ]
 HEIGHT = {part: -level for level, parts in enumerate(FLOORS) for part in parts}
@@ -45,7 +46,7 @@ EDGES = {
     "shimmy": {"zoo"},
     "dm_control": {"zoo"},
     "optuna": {"tuning"},
-    "matplotlib": {"report"},
+    "matplotlib": {"pages"},
     "rliable": {"report"},
     "onnx": {"export"},
     "onnxruntime": {"export"},

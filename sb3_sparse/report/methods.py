@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from sb3_sparse.pages.look import Look
 
 DENSE, EQUAL = "dense", "dense-equal"
 NAMES = {
@@ -17,15 +16,6 @@ NAMES = {
     "mst": "MST",
     "rlx2": "RLx2",
 }
-
-
-@dataclass(frozen=True)
-class Look:
-    """The colour, marker and line style of a method."""
-
-    color: str
-    marker: str
-    line: Any
 
 
 # Colours and markers are the paper's (IBM's colour-blind-safe palette) for what it compares. Line

@@ -7,7 +7,8 @@ from pathlib import Path
 
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.files import write_csv, written_whole
-from sb3_sparse.report.figures import NotEnoughData, check_figures, draw, save
+from sb3_sparse.pages.plot import save
+from sb3_sparse.report.figures import NotEnoughData, check_figures, draw
 from sb3_sparse.report.page import CSV_FILES, Content, Shown, render
 from sb3_sparse.report.reading import read_runs
 from sb3_sparse.report.results import Results

@@ -14,13 +14,7 @@ from sb3_sparse.report.figures import (  # noqa: F401
     sensitivity,
     snr,
 )
-from sb3_sparse.report.figures.base import (
-    FIGURES,
-    Drawing,
-    check_figures,
-    draw,
-    save,
-)
+from sb3_sparse.report.figures.base import FIGURES, check_figures, draw
 from sb3_sparse.report.results import NotEnoughData
 
-__all__ = ["FIGURES", "Drawing", "NotEnoughData", "check_figures", "draw", "save"]
+__all__ = ["FIGURES", "NotEnoughData", "check_figures", "draw"]

@@ -8,8 +8,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from sb3_sparse.intervals import mean_interval
+from sb3_sparse.pages.plot import Drawing
 from sb3_sparse.report.data import Array, RunData
-from sb3_sparse.report.figures.base import Drawing, Sheet, figure
+from sb3_sparse.report.figures.base import Sheet, figure
 from sb3_sparse.report.methods import DENSE, look_of, name_of, percent
 from sb3_sparse.report.results import NotEnoughData, Results
 

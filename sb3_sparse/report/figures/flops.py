@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from sb3_sparse.report.backend import PercentFormatter
-from sb3_sparse.report.figures.base import Drawing, Sheet, figure
+from sb3_sparse.pages.plot import Drawing, PercentFormatter
+from sb3_sparse.report.figures.base import Sheet, figure
 from sb3_sparse.report.methods import DENSE, EQUAL
 from sb3_sparse.report.results import NotEnoughData, Results
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from sb3_sparse.report.figures.base import Drawing, Sheet, figure
+from sb3_sparse.pages.plot import Drawing
+from sb3_sparse.report.figures.base import Sheet, figure
 from sb3_sparse.report.methods import DENSE, EQUAL, look_of, name_of
 from sb3_sparse.report.results import NotEnoughData, Results
 from sb3_sparse.report.scores import panels_of

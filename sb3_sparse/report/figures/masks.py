@@ -8,10 +8,10 @@ import numpy as np
 
 from sb3_sparse.errors import SparsityError
 from sb3_sparse.loading.zips import look_into
+from sb3_sparse.pages.plot import Drawing, MaxNLocator
 from sb3_sparse.policies.compiled import plain_names
-from sb3_sparse.report.backend import MaxNLocator
 from sb3_sparse.report.data import Array, RunData
-from sb3_sparse.report.figures.base import Drawing, Sheet, figure
+from sb3_sparse.report.figures.base import Sheet, figure
 from sb3_sparse.report.methods import name_of, percent
 from sb3_sparse.report.results import NotEnoughData, Results
 from sb3_sparse.zoo.folder import env_name

@@ -6,8 +6,8 @@ from statistics import fmean
 
 import numpy as np
 
-from sb3_sparse.report.backend import Axes
-from sb3_sparse.report.figures.base import Drawing, Sheet, ends_of, figure, line, logarithmic
+from sb3_sparse.pages.plot import Axes, Drawing, line, logarithmic
+from sb3_sparse.report.figures.base import Sheet, ends_of, figure
 from sb3_sparse.report.methods import DENSE, EQUAL, in_order, look_of, name_of, percent
 from sb3_sparse.report.results import NotEnoughData, Results
 from sb3_sparse.report.statistics import Estimate, mean

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from statistics import fmean
 
+from sb3_sparse.pages.plot import Drawing, line, logarithmic
 from sb3_sparse.report.data import RunData
-from sb3_sparse.report.figures.base import Drawing, Sheet, ends_of, figure, line, logarithmic
+from sb3_sparse.report.figures.base import Sheet, ends_of, figure
 from sb3_sparse.report.methods import DENSE, in_order, name_of, percent, shaded
 from sb3_sparse.report.results import NotEnoughData, Results
 from sb3_sparse.report.statistics import mean

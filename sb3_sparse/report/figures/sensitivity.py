@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+from sb3_sparse.pages.plot import Drawing
 from sb3_sparse.report.data import RunData
-from sb3_sparse.report.figures.base import Drawing, Sheet, figure
+from sb3_sparse.report.figures.base import Sheet, figure
 from sb3_sparse.report.methods import DENSE, in_order, look_of, name_of, percent
 from sb3_sparse.report.results import NotEnoughData, Results
 from sb3_sparse.report.statistics import mean

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections import defaultdict
 
-from sb3_sparse.report.figures.base import Drawing, Sheet, figure, logarithmic
+from sb3_sparse.pages.plot import Drawing, logarithmic
+from sb3_sparse.report.figures.base import Sheet, figure
 from sb3_sparse.report.measured import SNR, Points, snr_by_network
 from sb3_sparse.report.methods import DENSE, name_of, percent, shaded
 from sb3_sparse.report.results import NotEnoughData, Results
