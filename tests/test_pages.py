@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import re
 
+import pytest
+
 from sb3_sparse.pages import html
-from sb3_sparse.pages.table import Table
+from sb3_sparse.pages.numbers import short, shorten
+from sb3_sparse.pages.table import Cell, Table
 
 GIVEN = Table(
     ["name", "score", "verdict"],
@@ -28,6 +31,42 @@ def test_marks_are_of_texts_and_heads_stand_above_their_numbers():
     assert "<td>no</td>" in text
     heads = re.findall(r'<th scope="col" aria-sort="none"(.*?)>', text)
     assert heads == ["", ' class="number"', ""]
+
+
+def test_a_cell_with_a_text_of_its_own_sorts_by_its_value():
+    text = html.table(Table(["score"], [[Cell(370.2, "370")], [Cell(-8.0, "<8", strong=True)]]))
+    assert '<th scope="col" aria-sort="none" class="number">' in text
+    assert '<td class="number" data-value="370.2">370</td>' in text
+    assert '<td class="number" data-value="-8.0"><strong>&lt;8</strong></td>' in text
+
+
+@pytest.mark.parametrize(
+    ("value", "two", "three"),
+    [
+        (0.0, "0", "0"),
+        (-0.0, "0", "0"),
+        (-154.03, "-150", "-154"),
+        (5432.1, "5,400", "5,430"),
+        (99.96, "100", "100"),
+        (0.25, "0.25", "0.25"),
+        (1e-6, "1e-6", "1e-6"),
+        (0.00012345, "1.2e-4", "1.23e-4"),
+        (0.0012345, "0.0012", "0.00123"),
+        (1e6, "1,000,000", "1,000,000"),
+        (-12345678.0, "-1.2e7", "-1.23e7"),
+        (float("nan"), "nan", "nan"),
+    ],
+)
+def test_a_number_is_short(value, two, three):
+    assert (short(value), short(value, 3)) == (two, three)
+
+
+def test_numbers_that_are_compared_get_a_third_digit_where_two_would_tie():
+    assert shorten([-154.03, -76.1]) == ["-150", "-76"]
+    assert shorten([-154.03, -151.2, -76.125]) == ["-154", "-151", "-76.1"]
+    assert shorten([500.0, 500.0]) == ["500", "500"]  # they do tie
+    assert shorten([500.01, 500.02]) == ["500", "500"]
+    assert shorten([]) == []
 
 
 def test_text_is_never_html():

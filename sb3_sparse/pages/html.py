@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from html import escape
 from typing import Any
 
-from sb3_sparse.pages.table import Table
+from sb3_sparse.pages.table import Cell, Table
 
 READABLE = 0.9  # CSS pixels a point
 STYLE = """
@@ -182,12 +182,15 @@ def _side(column: int, table: Table) -> str:
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool)
+    return isinstance(value, (int, float, Cell)) and not isinstance(value, bool)
 
 
 def _cell(value: Any, table: Table) -> str:
     if value is None or (isinstance(value, float) and math.isnan(value)):
         return "<td></td>"
+    if isinstance(value, Cell):
+        text = f"<strong>{escape(value.text)}</strong>" if value.strong else escape(value.text)
+        return f'<td class="number" data-value="{value.value!r}">{text}</td>'
     if _is_number(value):
         text = f"{value:,}" if isinstance(value, int) else f"{value:.{table.digits}g}"
         return f'<td class="number" data-value="{value!r}">{text}</td>'

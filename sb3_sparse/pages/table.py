@@ -8,11 +8,26 @@ from typing import Any
 
 
 @dataclass(frozen=True)
+class Cell:
+    """An entry that does not show its value with the table's digits.
+
+    :param value: what a page sorts by
+    :param text: what it shows
+    :param strong: whether it stands out
+    """
+
+    value: float
+    text: str
+    strong: bool = False
+
+
+@dataclass(frozen=True)
 class Table:
     """Named columns and their rows.
 
     :param heads: names of the columns
-    :param rows: an entry for each column; None is an empty cell
+    :param rows: an entry for each column: a text, a number or a :class:`Cell`; None is an empty
+        cell
     :param digits: significant digits of floats on a page
     :param marks: ``"good"``, ``"bad"`` or ``"open"`` by the text of a cell, for cells that a page
         marks
