@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 from sb3_sparse.pages.look import Look
+from sb3_sparse.pages.names import METHODS
 
 DENSE, EQUAL = "dense", "dense-equal"
 NAMES = {
     DENSE: "Dense: 100 %",
     EQUAL: "Dense, equal parameters",
-    "prune": "Pruning",
-    "static": "Static",
-    "set": "SET",
-    "rigl": "RigL",
-    "granet": "GraNet",
-    "mst": "MST",
-    "rlx2": "RLx2",
+    **METHODS,
 }
 
 
