@@ -268,8 +268,26 @@ def test_medium_has_all_ways_at_two_sparsities_and_seeds_enough(name, seeds, ste
 
 def test_some_studies_have_a_scale_medium():
     names = [name for name in study_names() if "medium" in planned_runs(name)]
-    assert names == ["classic_control", "ppo", "robust_value", "sac", "scaling"]
+    assert names == [
+        *("classic_control", "distribution", "noise", "ppo", "robust_value", "sac", "scaling"),
+        *("snr", "weight_decay"),
+    ]
     assert set(SCALES) == {scale for name in study_names() for scale in planned_runs(name)}
+
+
+@pytest.mark.parametrize(
+    ("name", "shared"),
+    [
+        # Two tasks and ten seeds: dense, and ERK by SET and RigL at 90 and 95 %.
+        ("distribution", 2 * 10 * (1 + 2 * 2)),
+        ("weight_decay", 2 * 10 * (1 + 2)),  # the config's decay: dense, SET and RigL at 90 %
+        ("noise", 2 * 10 * (1 + 1 + 2)),  # dense, dense of equal size, SET and RigL at 90 %
+    ],
+)
+def test_studies_of_dqn_at_medium_share_the_cells_of_classic_control(name, shared):
+    trained = {cell.address for cell in Study.read("classic_control", "medium").cells}
+    cells = Study.read(name, "medium").cells
+    assert sum(cell.address in trained for cell in cells) == shared
 
 
 def test_dense_widths_of_the_actor_critic_study_keep_their_budget():
