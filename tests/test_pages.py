@@ -71,9 +71,29 @@ def test_numbers_that_are_compared_get_a_third_digit_where_two_would_tie():
 
 def test_text_is_never_html():
     nasty = '<b>"&'
-    parts = [html.paragraph(nasty), html.section(nasty), html.subsection(nasty), html.code(nasty)]
+    parts = [html.paragraph(nasty), html.lead(nasty), html.subsection(nasty), html.code(nasty)]
     parts += [html.listing([nasty]), html.folded(nasty), html.link(nasty, nasty)]
     parts += [html.image(b"<svg/>", nasty), html.figure(nasty, nasty, "", nasty, [])]
-    page = html.page(nasty, parts)
+    page = html.page(nasty, parts, [html.section(nasty)])
     assert "<b>" not in page
-    assert page.count("&lt;b&gt;") == 14
+    assert page.count("&lt;b&gt;") == 16  # a heading stands in the contents, too
+
+
+def test_the_contents_of_a_page_lead_to_its_sections():
+    sections = [html.section("All cells, by task", "<p>one</p>"), html.section("Left out")]
+    page = html.page("A study", [html.lead("SET won.")], sections)
+    anchors = re.findall(r'<li><a href="#(.*?)">(.*?)</a></li>', page)
+    assert anchors == [("all-cells-by-task", "All cells, by task"), ("left-out", "Left out")]
+    assert [page.count(f'<section id="{anchor}">') for anchor, _ in anchors] == [1, 1]
+    assert page.index("SET won.") < page.index("<nav") < page.index("<p>one</p>")
+
+
+def test_columns_of_one_value_are_said_once():
+    table = Table(
+        ["task", "method", "seeds", "remark"], [["A", "set", 3, None], ["A", "rigl", 3, None]]
+    )
+    shorter, same = table.varying()
+    assert (shorter.heads, shorter.rows) == (["method"], [["set"], ["rigl"]])
+    assert same == {"task": "A", "seeds": 3}
+    one = Table(["task", "seeds"], [["A", 3]])
+    assert one.varying() == (one, {})

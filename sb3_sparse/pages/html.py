@@ -5,7 +5,8 @@ from __future__ import annotations
 import base64
 import math
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from html import escape
 from typing import Any
 
@@ -22,6 +23,8 @@ body { font: 16px/1.5 system-ui, sans-serif; margin: 0 auto; max-width: 78rem; p
 h1 { font-size: 1.7rem; line-height: 1.2; } h2 { margin-top: 2.5rem; }
 h1, h2, h3, p, li, code, figcaption, summary { overflow-wrap: anywhere; }
 a { color: var(--link); }
+.lead { font-size: 1.15rem; max-width: 48rem; }
+nav ul { list-style: none; padding: 0; display: flex; flex-wrap: wrap; gap: .2rem 1.2rem; }
 .scroll { overflow-x: auto; border: 1px solid var(--line); border-radius: 6px; }
 table { border-collapse: collapse; font-size: .85rem; width: 100%; }
 th, td { padding: .3rem .6rem; text-align: left; border-bottom: 1px solid var(--line);
@@ -72,14 +75,38 @@ document.querySelectorAll("th button").forEach(function (button) {
 """
 
 
-def page(title: str, parts: Iterable[str], script: str = "") -> str:
-    """Join HTML parts to a whole page.
+@dataclass(frozen=True)
+class Section:
+    """A part of a page with a heading, which the page's contents link to.
+
+    :param heading: text, of which a page has no other section
+    :param body: HTML
+    """
+
+    heading: str
+    body: str
+
+    @property
+    def anchor(self) -> str:
+        """The section's address within the page."""
+        return re.sub(r"[^a-z0-9]+", "-", self.heading.lower()).strip("-")
+
+    def __str__(self) -> str:
+        return (
+            f'<section id="{self.anchor}"><h2>{escape(self.heading)}</h2>\n{self.body}\n</section>'
+        )
+
+
+def page(title: str, lead: Iterable[str], sections: Sequence[Section], script: str = "") -> str:
+    """Join HTML to a whole page, with a list of its sections below its lead.
 
     :param title: text
-    :param parts: HTML
+    :param lead: HTML above the contents
+    :param sections: the rest of the page
     :param script: JavaScript that the parts need
     """
     head = f"<script>{script}</script>" if script else ""
+    parts = [*lead, _contents(sections), *map(str, sections)]
     return (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
@@ -90,10 +117,19 @@ def page(title: str, parts: Iterable[str], script: str = "") -> str:
     )
 
 
-def section(heading: str, *parts: str) -> str:
+def _contents(sections: Sequence[Section]) -> str:
+    links = (f"<li>{link(f'#{one.anchor}', one.heading)}</li>" for one in sections)
+    return f'<nav aria-label="contents"><ul>{"".join(links)}</ul></nav>'
+
+
+def section(heading: str, *parts: str) -> Section:
     """Put parts under a heading."""
-    body = "\n".join(parts)
-    return f"<section><h2>{escape(heading)}</h2>\n{body}\n</section>"
+    return Section(heading, "\n".join(parts))
+
+
+def lead(text: str) -> str:
+    """Make the paragraph that says what the page found."""
+    return f'<p class="lead">{escape(text)}</p>'
 
 
 def subsection(heading: str, *parts: str) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 
@@ -37,3 +37,19 @@ class Table:
     rows: Sequence[Sequence[Any]]
     digits: int = 4
     marks: Mapping[str, str] = field(default_factory=dict)
+
+    def varying(self) -> tuple[Table, dict[str, Any]]:
+        """Return the table without the columns whose entries are all equal, and what these hold.
+
+        A table of one row keeps its columns; an empty column is left out without a word.
+        """
+        columns = list(zip(*self.rows, strict=True))
+        same = {
+            place: column[0]
+            for place, column in enumerate(columns)
+            if len(column) > 1 and all(entry == column[0] for entry in column)
+        }
+        kept = [place for place in range(len(self.heads)) if place not in same]
+        rows = [[row[place] for place in kept] for row in self.rows]
+        table = replace(self, heads=[self.heads[place] for place in kept], rows=rows)
+        return table, {self.heads[p]: value for p, value in same.items() if value is not None}

@@ -86,9 +86,8 @@ class Content:
 def render(content: Content) -> str:
     """Return the page's HTML."""
     results = content.results
+    lead = [html.paragraph(_counts(content)), html.paragraph(f"Findings are those of {PAPER}.")]
     parts = [
-        html.paragraph(_counts(content)),
-        html.paragraph(f"Findings are those of {PAPER}."),
         _verdicts(content),
         html.section("Figures", *map(_figure, content.figures)),
         html.section(
@@ -107,7 +106,7 @@ def render(content: Content) -> str:
     if content.pending or content.command:
         parts.append(_pending(content))
     parts.append(_versions(results))
-    return html.page(content.title, parts)
+    return html.page(content.title, lead, parts)
 
 
 def _counts(content: Content) -> str:
@@ -125,7 +124,7 @@ def _counts(content: Content) -> str:
     )
 
 
-def _verdicts(content: Content) -> str:
+def _verdicts(content: Content) -> html.Section:
     rules = [
         f"{one.text} {one.rule}; {one.region.text}. At least {LEAST_SEEDS} seeds of both sides."
         for one in FINDINGS
@@ -156,7 +155,7 @@ def _figure(shown: Shown) -> str:
     )
 
 
-def _normalisation(results: Results) -> str:
+def _normalisation(results: Results) -> html.Section:
     parts = [html.paragraph(HOW)]
     if results.normaliser.scales:
         parts.append(html.listing(results.normaliser.statements()))
@@ -174,7 +173,7 @@ def _normalisation(results: Results) -> str:
     return html.section("Scores and normalisation", *parts)
 
 
-def _diverged(content: Content) -> list[str]:
+def _diverged(content: Content) -> list[html.Section]:
     if not content.diverged:
         return []
     texts = [f"{one.folder}: {one.reason}" for one in content.diverged]
@@ -185,7 +184,7 @@ def _diverged(content: Content) -> list[str]:
     return [html.section("Diverged", html.paragraph(warning), html.listing(texts))]
 
 
-def _left_out(content: Content) -> str:
+def _left_out(content: Content) -> html.Section:
     texts = [f"{one.folder}: {one.reason}" for one in content.others]
     parts = [html.listing(texts) if texts else html.paragraph("No run folder was left out.")]
     if content.results.remarks:
@@ -196,7 +195,7 @@ def _left_out(content: Content) -> str:
     return html.section("Left out", *parts)
 
 
-def _pending(content: Content) -> str:
+def _pending(content: Content) -> html.Section:
     parts = [html.paragraph(f"Runs that are planned and not done: {len(content.pending)}.")]
     if content.pending:
         parts.append(html.folded("Which", html.listing(content.pending)))
@@ -205,7 +204,7 @@ def _pending(content: Content) -> str:
     return html.section("Pending", *parts)
 
 
-def _versions(results: Results) -> str:
+def _versions(results: Results) -> html.Section:
     found: dict[str, set[str]] = {}
     for run in results.runs:
         versions = run.record.get("versions")

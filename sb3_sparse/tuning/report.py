@@ -60,7 +60,7 @@ def write_report(studies: Sequence[optuna.Study], storage: BaseStorage, path: Pa
             )
     title = "Tuning: " + ", ".join(search.name for search in searches)
     parts = [_best_by_method(searches, storage), *map(_about, searches)]
-    page = html.page(title, parts, script=plotly.offline.get_plotlyjs())
+    page = html.page(title, [], parts, script=plotly.offline.get_plotlyjs())
     path.parent.mkdir(parents=True, exist_ok=True)
     with written_whole(path) as new:
         new.write_text(page, encoding="utf-8")
@@ -86,7 +86,7 @@ def report_by_name(
     return write_report(studies, opened, path or folder / "report.html")
 
 
-def _about(search: Search) -> str:
+def _about(search: Search) -> html.Section:
     definition, status = search.definition, search.status()
     pruned = len(status.done) - len(status.complete)
     run = definition.run
@@ -142,7 +142,7 @@ def _scores(trial: FrozenTrial) -> str:
     return ", ".join(f"{score:.6g}" for score in trial.user_attrs.get("scores", []))
 
 
-def _best_by_method(searches: Sequence[Search], storage: BaseStorage) -> str:
+def _best_by_method(searches: Sequence[Search], storage: BaseStorage) -> html.Section:
     tasks = {_task(search.definition) for search in searches}
     rows, unread = [], []
     for summary in storage.get_all_studies():

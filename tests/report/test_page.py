@@ -152,7 +152,7 @@ def test_runs_that_diverged_have_a_section_of_their_own(folders, tmp_path):
         folders.add("rigl", 0.9, seed, status=status)
     page = write_report(folders.made, tmp_path / "out", title="T", figures=["iqm"]).read_text()
     assert "diverged: 1; left out: 1; pending: 0." in page
-    diverged = page.split(">Diverged<")[1].split("</section>")[0]
+    diverged = page.split("<h2>Diverged<")[1].split("</section>")[0]
     assert "DQN on CartPole-v1, rigl 90%, seed 1: training diverged" in diverged
     assert "seed 2" not in diverged
 

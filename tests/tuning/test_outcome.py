@@ -188,7 +188,7 @@ def test_the_page_and_its_csv(study, storage, tmp_path):
         assert f"<h3>{title}</h3>" in page
     assert page.count('class="plotly-graph-div"') == 4
     assert "src=" not in page[page.index("</head>") :]  # nothing is loaded
-    table = page[page.index("Best of each method") : page.index("<h2>mine</h2>")]
+    table = page[page.index("<h2>Best of each method") : page.index("<h2>mine</h2>")]
     rows = re.findall(r"<tr><td>dqn.*?</tr>", table)
     assert len(rows) == 2
     assert '<td>rigl at 90%</td><td class="number" data-value="99.0">99</td>' in rows[0]
