@@ -26,9 +26,10 @@ from sb3_sparse.zoo.disk import refusal
 from sb3_sparse.zoo.folder import RunFolder
 from sb3_sparse.zoo.manager import spaces_of
 from sb3_sparse.zoo.match import Match, match_parameters, untrained_policy
-from sb3_sparse.zoo.record import Status, versions
+from sb3_sparse.zoo.record import Status
 from sb3_sparse.zoo.settings import Settings
 from sb3_sparse.zoo.spec import RunSpec
+from sb3_sparse.zoo.versions import versions
 
 
 @dataclass(frozen=True)

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import json
-import platform
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager
 from enum import Enum
 from functools import cached_property
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -22,15 +20,6 @@ NAME = "sparsity.json"
 WHAT = "record of a run"
 CURE = "restore it from a copy, or remove the run's folder and train anew"
 FORMAT = 1
-PACKAGES = (
-    "sb3-sparse",
-    "stable-baselines3",
-    "sb3-contrib",
-    "rl_zoo3",
-    "torch",
-    "gymnasium",
-    "numpy",
-)
 
 
 class Status(str, Enum):
@@ -176,14 +165,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, Mapping):
         return dict(value)
     return str(value)
-
-
-def versions() -> dict[str, str]:
-    """Return the versions of Python and of every package that affects a run."""
-    found = {"python": platform.python_version()}
-    for package in PACKAGES:
-        try:
-            found[package] = version(package)
-        except PackageNotFoundError:
-            continue
-    return found

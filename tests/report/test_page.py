@@ -162,6 +162,17 @@ def test_a_report_on_nothing_is_a_page_all_the_same(tmp_path):
     assert page.count("Left out: ") == len(FIGURES)
 
 
+def test_the_page_names_the_commits_of_its_runs(folders, tmp_path):
+    """Records of older versions have none."""
+    for seed, commit in enumerate(["0123456789ab", "ba9876543210 changed", None]):
+        record = folders.add(seed=seed) / "sparsity.json"
+        content = json.loads(record.read_text())
+        content["versions"].update({} if commit is None else {"commit": commit})
+        record.write_text(json.dumps(content))
+    page = write_report(folders.made, tmp_path / "out", title="T", figures=["iqm"]).read_text()
+    assert "commit 0123456789ab and ba9876543210 changed" in page
+
+
 def test_an_unknown_figure_is_refused_before_anything_is_written(tmp_path):
     with pytest.raises(ConfigError, match="unknown figure 'pie'; allowed are .*iqm"):
         write_report([], tmp_path / "out", title="t", figures=["pie"])
