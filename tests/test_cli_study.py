@@ -77,7 +77,10 @@ def test_a_report_of_nothing_is_a_mistake_and_makes_nothing(tmp_path, mistake):
             ["status", "sac", "--scale", "huge"],
             "has no scale 'huge', only smoke, small, medium, paper",
         ),
-        (["run", "snr", "--scale", "medium"], "has no scale 'medium', only smoke, small, paper"),
+        (
+            ["run", "batch_size", "--scale", "medium"],
+            "has no scale 'medium', only smoke, small, paper",
+        ),
         (["report", "snr", "--archive", "no.jsonl"], "there is no file no.jsonl; study run --arch"),
         (["run", "flops", "--launcher", "slurm"], "unknown launcher 'slurm'"),
     ],

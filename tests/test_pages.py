@@ -20,7 +20,7 @@ GIVEN = Table(
 
 def test_a_cell_shows_its_value_rounded_and_keeps_it_for_sorting():
     rows = re.findall(r"<tr><td>(.*?)</tr>", html.table(GIVEN))
-    assert rows[0].startswith('&lt;a&gt;</td><td class="number" data-value="1234.5678">1.23e+03<')
+    assert rows[0].startswith('&lt;a&gt;</td><td class="number" data-value="1234.5678">1,230<')
     assert rows[1].startswith("b</td><td></td>")
     assert rows[2].startswith('c</td><td class="number" data-value="12000">12,000<')
 

@@ -166,7 +166,7 @@ def report(
         title=f"{study.title} ({scale})",
         figures=study.figures,
         varies=study.varies,
-        command=asked.command("run"),
+        command="\n".join((asked.command("run"), asked.command("report"))),
         archived=archived,
         pending=[_pending(one, store) for one in statuses if not one.state.is_over],
     )

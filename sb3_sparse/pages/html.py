@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from html import escape
 from typing import Any
 
+from sb3_sparse.pages.numbers import short
 from sb3_sparse.pages.table import Cell, Table
 
 READABLE = 0.9  # CSS pixels a point
@@ -228,7 +229,7 @@ def _cell(value: Any, table: Table) -> str:
         text = f"<strong>{escape(value.text)}</strong>" if value.strong else escape(value.text)
         return f'<td class="number" data-value="{value.value!r}">{text}</td>'
     if _is_number(value):
-        text = f"{value:,}" if isinstance(value, int) else f"{value:.{table.digits}g}"
+        text = f"{value:,}" if isinstance(value, int) else short(value, table.digits)
         return f'<td class="number" data-value="{value!r}">{text}</td>'
     text = str(value)
     kind = table.marks.get(text) or ("wide" if len(text) > 40 else "")

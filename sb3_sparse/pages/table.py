@@ -35,19 +35,23 @@ class Table:
 
     heads: Sequence[str]
     rows: Sequence[Sequence[Any]]
-    digits: int = 4
+    digits: int = 2
     marks: Mapping[str, str] = field(default_factory=dict)
 
-    def varying(self) -> tuple[Table, dict[str, Any]]:
+    def varying(self, *keep: str) -> tuple[Table, dict[str, Any]]:
         """Return the table without the columns whose entries are all equal, and what these hold.
 
         A table of one row keeps its columns; an empty column is left out without a word.
+
+        :param keep: heads of columns that stay
         """
         columns = list(zip(*self.rows, strict=True))
         same = {
             place: column[0]
             for place, column in enumerate(columns)
-            if len(column) > 1 and all(entry == column[0] for entry in column)
+            if len(column) > 1
+            and self.heads[place] not in keep
+            and all(entry == column[0] for entry in column)
         }
         kept = [place for place in range(len(self.heads)) if place not in same]
         rows = [[row[place] for place in kept] for row in self.rows]

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from statistics import fmean
 
 from sb3_sparse.report.data import RunData
 from sb3_sparse.report.methods import DENSE
-from sb3_sparse.zoo.environments import ATARI, game_of, suite_of
+from sb3_sparse.zoo.environments import ATARI, DM_CONTROL, game_of, suite_of
 
 # (random play, professional human tester). Source: Mnih et al. 2015 (Nature 518:529), extended data
 # table 2. The table of DQN Zoo and rliable differs: its human scores are of a later tester.
@@ -37,6 +38,18 @@ CONTROL_SCALE = {
     "MountainCar": (-200.0, -110.0),
     "Pendulum": (-1223.0, -150.0),
 }
+# (least, greatest) return of an episode. Source: Gymnasium's rewards of a step and limits of steps:
+# CartPole-v1 +1 in at most 500, Acrobot-v1 -1 in at most 500, MountainCar-v0 -1 in at most 200,
+# Pendulum-v1 at least -(pi^2 + 0.1 * 8^2 + 0.001 * 2^2) in 200. The DeepMind Control Suite: at most
+# 1 in each of 1,000 steps (arXiv:1801.00690).
+CONTROL_RETURNS = {
+    "CartPole": (0.0, 500.0),
+    "Acrobot": (-500.0, 0.0),
+    "MountainCar": (-200.0, 0.0),
+    "Pendulum": (-3254.8, 0.0),
+}
+SUITE_RETURNS = {DM_CONTROL: (0.0, 1000.0)}
+ANY = (-math.inf, math.inf)
 PAIRS = {
     **{name: (*pair, "human-normalised, Mnih et al. 2015") for name, pair in HUMAN.items()},
     **{name: (*pair, "random policy to solved") for name, pair in CONTROL_SCALE.items()},
@@ -58,6 +71,11 @@ class Scale:
 
     def __call__(self, score: float) -> float:
         return (score - self.zero) / (self.one - self.zero)
+
+
+def possible_returns(env_id: str) -> tuple[float, float]:
+    """Return the least and the greatest return of an episode; infinite where none is known."""
+    return CONTROL_RETURNS.get(game_of(env_id)) or SUITE_RETURNS.get(suite_of(env_id)) or ANY
 
 
 class Normaliser:
@@ -82,6 +100,14 @@ class Normaliser:
         """Normalise a run's score, or another return of its task; None without a scale."""
         scale = self.scales.get((run.family, run.env_id))
         return None if scale is None else scale(run.score if score is None else score)
+
+    def within(self, family: str, env_id: str) -> tuple[float, float]:
+        """Return the least and the greatest normalised return of an episode of a task."""
+        scale = self.scales.get((family, env_id))
+        if scale is None:
+            return ANY
+        low, high = map(scale, possible_returns(env_id))
+        return low, high
 
     def statements(self) -> list[str]:
         """Return a line for each task that tells what 0 and 1 stand for."""

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from sb3_sparse.pages import html
-from sb3_sparse.pages.table import Table
+from sb3_sparse.pages.table import Cell, Table
 from sb3_sparse.report.data import LeftOut
 from sb3_sparse.report.figures import FIGURES
+from sb3_sparse.report.methods import percent
 from sb3_sparse.report.results import Results
-from sb3_sparse.report.tables import verdicts_table
+from sb3_sparse.report.summary import scores, sentences
+from sb3_sparse.report.tables import findings_table
 from sb3_sparse.report.verdicts import FINDINGS, LEAST_SEEDS, Verdict
 
 CSV_FILES = ("cells.csv", "runs.csv", "verdicts.csv")
@@ -21,17 +23,24 @@ HOW = (
     "1,000) from a fixed seed. rliable needs as many runs of every task: each task gives its "
     "lowest seeds, as many as the scarcest task has. These intervals are rliable's own and too "
     "narrow for few seeds (they cover 75 to 90 % of truths at 3 to 5). Means of one cell: "
-    "Student's t; where figures would be all band, the bands are cut at their panel's edge. Where "
-    "a cell has runs of several settings, methods are compared by those that change the fewest "
-    "settings of their config, then by those with most seeds."
+    "Student's t, cut where no return is possible. Where a cell has runs of several settings, "
+    "methods are compared by those that change the fewest settings of their config, then by those "
+    "with most seeds."
 )
 INTERVALS = (
     "Effect: difference of the two sides, with a 95 % stratified bootstrap interval, widened for "
     "few seeds (by sqrt(n/(n-1)) and from normal to Student's t): with 3 seeds the plain "
-    "bootstrap is much too narrow. Each environment, or environment and sparsity, is a stratum. "
-    f"A stratum with fewer than {LEAST_SEEDS} seeds of either side does not count, and without "
-    "any there is no verdict. Several findings are tested at 95 % each, with no correction. "
-    '"Not enough data" is also the verdict if the interval decides nothing.'
+    "bootstrap is much too narrow. A comparison with fewer than "
+    f"{LEAST_SEEDS} seeds of either side does not count, and without any there is no verdict. "
+    "Several findings are tested at 95 % each, with no correction. "
+    '"Not enough data" is also the verdict if the interval decides nothing; then "seeds needed" '
+    "is how many of each side would probably decide it, if the effect stays as it is."
+)
+SCALES = (
+    "Scales: Atari by random play and human testers of Mnih et al. 2015; classic control "
+    "from a uniformly random policy, measured with Gymnasium 1.4, to Gymnasium's reward "
+    "threshold (Pendulum, which has none: -150); MuJoCo and all else divided by the mean "
+    "score of the dense network of full size of the same algorithm."
 )
 
 
@@ -60,7 +69,7 @@ class Content:
     :param figures: the figures, in order
     :param left_out: runs, or files of runs, that are not in the report
     :param pending: cells that are planned and not done
-    :param command: the command that continues what is pending; empty if there is none
+    :param command: the commands that continue what is pending and make the page; may be empty
     """
 
     title: str
@@ -84,29 +93,21 @@ class Content:
 
 
 def render(content: Content) -> str:
-    """Return the page's HTML."""
-    results = content.results
-    lead = [html.paragraph(_counts(content)), html.paragraph(f"Findings are those of {PAPER}.")]
-    parts = [
-        _verdicts(content),
-        html.section("Figures", *map(_figure, content.figures)),
-        html.section(
-            "All cells",
-            html.paragraph(
-                "IQM and interval over the seeds of one cell, in raw scores. Compared: whether "
-                "figures and verdicts that compare methods take these runs."
-            ),
-            html.table(content.cells),
-            html.paragraph("", *(html.link(name, name) for name in CSV_FILES)),
-        ),
-        _normalisation(results),
+    """Return the page's HTML: what was found, what shows it, and what it is made of."""
+    drawn = [shown for shown in content.figures if shown.svg is not None]
+    hero, more = drawn[:1], [shown for shown in content.figures if shown not in drawn[:1]]
+    lead = [html.lead(text) for text in sentences(content.results)]
+    sections = [
+        *_scores(content.results, hero),
+        _findings(content),
+        *([html.section("Figures", *map(_figure, more))] if more else ()),
+        _cells(content),
         *_diverged(content),
         _left_out(content),
+        _settings(content.results),
+        *_pending(content),
     ]
-    if content.pending or content.command:
-        parts.append(_pending(content))
-    parts.append(_versions(results))
-    return html.page(content.title, lead, parts)
+    return html.page(content.title, [*lead, html.paragraph(_counts(content))], sections)
 
 
 def _counts(content: Content) -> str:
@@ -114,26 +115,68 @@ def _counts(content: Content) -> str:
     runs = results.trained
     counted = len(results.runs) - len(runs)
     steps = sum(run.steps for run in runs)
-    seeds = len({run.seed for run in runs})
-    envs = len({run.env_id for run in results.runs})
     also = f", and {counted} only counted" if counted else ""
-    return (
-        f"Finished runs: {len(runs)}{also}; seeds: {seeds}; environments: {envs}; environment "
-        f"steps: {steps:,}; diverged: {len(content.diverged)}; left out: {len(content.others)}; "
-        f"pending: {len(content.pending)}."
-    )
+    without = {
+        "diverged": len(content.diverged),
+        "left out": len(content.others),
+        "still to be trained": len(content.pending),
+    }
+    missing = "".join(f"; {count} {what}" for what, count in without.items() if count)
+    finished = f"{len(runs)} finished run{'s' * (len(runs) != 1)}"
+    return f"{finished}{also}, {steps:,} environment steps{missing}."
 
 
-def _verdicts(content: Content) -> html.Section:
+def _scores(results: Results, hero: Sequence[Shown]) -> list[html.Section]:
+    found = scores(results)
+    parts = [
+        html.subsection(one.title, html.table(one.table), html.paragraph(one.note)) for one in found
+    ] + [_figure(shown) for shown in hero]
+    return [html.section("Scores", *parts)] if parts else []
+
+
+def _findings(content: Content) -> html.Section:
+    tested = [one for one in content.verdicts if one.has_data]
+    silent = [one.finding.text.removesuffix(".") for one in content.verdicts if not one.has_data]
+    parts = [html.paragraph(f"The findings are those of {PAPER}.")]
+    if tested:
+        parts += _shortened(findings_table(tested), "verdict")
+    if silent:
+        parts.append(html.paragraph(f"No runs here compare: {'; '.join(silent)}."))
     rules = [
         f"{one.text} {one.rule}; {one.region.text}. At least {LEAST_SEEDS} seeds of both sides."
         for one in FINDINGS
     ]
+    folded = html.folded("Rules", html.paragraph(INTERVALS), html.listing(rules))
+    return html.section("Findings of the paper", *parts, folded)
+
+
+def _cells(content: Content) -> html.Section:
     return html.section(
-        "Verdicts on the paper's findings",
-        html.table(verdicts_table(content.verdicts)),
-        html.folded("Rules", html.paragraph(INTERVALS), html.listing(rules)),
+        "All cells",
+        html.paragraph(
+            "The runs of a cell differ in their seeds alone. IQM and interval over its seeds, in "
+            "raw scores. Compared: whether figures and verdicts that compare methods take it."
+        ),
+        *_shortened(_in_percent(content.cells)),
+        html.paragraph("", *(html.link(name, name) for name in CSV_FILES)),
     )
+
+
+def _in_percent(table: Table) -> Table:
+    """Show sparsities in percent, in full: two digits would make 100 % of 99.9 %."""
+    place = table.heads.index("sparsity")
+    rows = [
+        [*row[:place], Cell(row[place], percent(row[place])), *row[place + 1 :]]
+        for row in table.rows
+    ]
+    return replace(table, rows=rows)
+
+
+def _shortened(table: Table, *keep: str) -> list[str]:
+    """Make a table without columns of one value, and a sentence of what these hold."""
+    shorter, same = table.varying(*keep)
+    texts = [f"{name} {value}" for name, value in same.items() if value != ""]
+    return [html.table(shorter), *([html.paragraph(f"All: {', '.join(texts)}.")] if texts else ())]
 
 
 def _figure(shown: Shown) -> str:
@@ -153,24 +196,6 @@ def _figure(shown: Shown) -> str:
         links,
         *(missing if shown.remarks else ()),
     )
-
-
-def _normalisation(results: Results) -> html.Section:
-    parts = [html.paragraph(HOW)]
-    if results.normaliser.scales:
-        parts.append(html.listing(results.normaliser.statements()))
-    if results.normaliser.missing:
-        parts.append(html.paragraph("Without a scale, so in no figure of normalised scores:"))
-        parts.append(html.listing(results.normaliser.missing))
-    parts.append(
-        html.paragraph(
-            "Scales: Atari by random play and human testers of Mnih et al. 2015; classic control "
-            "from a uniformly random policy, measured with Gymnasium 1.4, to Gymnasium's reward "
-            "threshold (Pendulum, which has none: -150); MuJoCo and all else divided by the mean "
-            "score of the dense network of full size of the same algorithm."
-        )
-    )
-    return html.section("Scores and normalisation", *parts)
 
 
 def _diverged(content: Content) -> list[html.Section]:
@@ -195,20 +220,53 @@ def _left_out(content: Content) -> html.Section:
     return html.section("Left out", *parts)
 
 
-def _pending(content: Content) -> html.Section:
-    parts = [html.paragraph(f"Runs that are planned and not done: {len(content.pending)}.")]
+def _settings(results: Results) -> html.Section:
+    """Say how runs were trained and scored, and by which versions."""
+    parts = [html.listing(_trained(results)), html.paragraph(HOW)]
+    if results.normaliser.scales:
+        parts.append(html.listing(results.normaliser.statements()))
+    if results.normaliser.missing:
+        parts.append(html.paragraph("Without a scale, so in no figure of normalised scores:"))
+        parts.append(html.listing(results.normaliser.missing))
+    parts.append(html.paragraph(SCALES))
+    versions = "; ".join(_versions(results)) or "none recorded"
+    return html.section("Settings", *parts, html.paragraph(f"Versions: {versions}."))
+
+
+def _trained(results: Results) -> list[str]:
+    """Say of each algorithm and its tasks how long it trained, and how it was evaluated."""
+    found: dict[str, dict[str, set[str]]] = {}
+    for run in results.trained:
+        facts = found.setdefault(run.family, {})
+        facts.setdefault("environment steps", set()).add(f"{run.steps:,}")
+        facts.setdefault("evaluations", set()).add(str(len(run.returns)))
+        facts.setdefault("seeds", set()).add(str(run.seed))
+    texts = []
+    for family, facts in found.items():
+        several = {name: " or ".join(sorted(values, key=len)) for name, values in facts.items()}
+        several["seeds"] = f"{len(facts['seeds'])}"
+        texts.append(
+            f"{family}: " + ", ".join(f"{value} {name}" for name, value in several.items())
+        )
+    return texts
+
+
+def _pending(content: Content) -> list[html.Section]:
+    if not content.pending and not content.command:
+        return []
+    parts = []
     if content.pending:
-        parts.append(html.folded("Which", html.listing(content.pending)))
+        summary = f"{len(content.pending)} runs are still to be trained"
+        parts.append(html.folded(summary, html.listing(content.pending)))
     if content.command:
-        parts += [html.paragraph("This continues it:"), html.code(content.command)]
-    return html.section("Pending", *parts)
+        parts.append(html.code(content.command))
+    return [html.section("Commands", *parts)]
 
 
-def _versions(results: Results) -> html.Section:
+def _versions(results: Results) -> list[str]:
     found: dict[str, set[str]] = {}
     for run in results.runs:
         versions = run.record.get("versions")
         for name, version in (versions if isinstance(versions, Mapping) else {}).items():
             found.setdefault(str(name), set()).add(str(version))
-    texts = [f"{name} {' and '.join(sorted(versions))}" for name, versions in found.items()]
-    return html.section("Versions", html.listing(texts or ["none recorded"]))
+    return [f"{name} {' and '.join(sorted(versions))}" for name, versions in found.items()]

@@ -20,6 +20,7 @@ work draws them, and too narrow for few seeds.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -30,6 +31,7 @@ from sb3_sparse.intervals import Array, mean_interval, t_quantile
 from sb3_sparse.report.backend import rliable_library
 
 REPS, SEED, LEAST = 2000, 0, 2
+MOST = 1000
 NORMAL_975 = 1.959963984540054
 
 
@@ -157,12 +159,32 @@ def difference(
         return np.array([statistic(a) - statistic(b)])
 
     plain = _bootstrap((x, y), subtract, reps)
-    freedom = x.shape[1] * (len(x) + len(y) - 2)
     least = min(len(x), len(y))
-    factor = np.sqrt(least / (least - 1)) * t_quantile(freedom) / NORMAL_975
+    factor = _widening(least, x.shape[1] * (len(x) + len(y) - 2))
     low = plain.value - factor * (plain.value - plain.low)
     high = plain.value + factor * (plain.high - plain.value)
     return Estimate(plain.value, float(low), float(high), least, x.shape[1])
+
+
+def _widening(least: int, freedom: int) -> float:
+    return float(np.sqrt(least / (least - 1)) * t_quantile(freedom) / NORMAL_975)
+
+
+def seeds_for(estimate: Estimate, share: float) -> int | None:
+    """Return the seeds with which an interval of :func:`difference` probably shrinks to a share.
+
+    It shrinks with the square root of their number, and is widened less.
+
+    :param estimate: a difference, of two sides with as many runs
+    :param share: wanted length by today's, more than 0
+    :return: None for more than 1,000
+    """
+
+    def length(seeds: int) -> float:
+        return _widening(seeds, 2 * estimate.tasks * (seeds - 1)) / math.sqrt(seeds)
+
+    wanted = share * length(estimate.seeds)
+    return next((n for n in range(estimate.seeds, MOST + 1) if length(n) <= wanted), None)
 
 
 def mean(values: Sequence[float]) -> Estimate:

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from sb3_sparse.pages.table import Table
+from sb3_sparse.pages.numbers import short
+from sb3_sparse.pages.table import Cell, Table
 from sb3_sparse.report.data import RunData
 from sb3_sparse.report.methods import DENSE, EQUAL, name_of
 from sb3_sparse.report.results import Results, cell_of, grouped
@@ -20,7 +21,8 @@ MARKS = {SUPPORTED: "good", CONTRADICTED: "bad", UNDECIDED: "open"}
 
 def cells_table(results: Results) -> Table:
     """Return a row for each family, environment, method, sparsity and variant of settings."""
-    heads = ["family", "environment", "method", "sparsity", "distribution", "settings", "compared"]
+    heads = ["algorithm and tasks", "environment", "method", "sparsity", "distribution"]
+    heads += ["settings", "compared"]
     if results.varies:
         heads.append(results.varies)
     heads += ["seeds", "mean score", "std", "IQM", "low", "high", "normalised mean"]
@@ -76,13 +78,32 @@ def runs_table(results: Results) -> Table:
     return Table(heads, rows)
 
 
+def findings_table(verdicts: Sequence[Verdict]) -> Table:
+    """Return a row for each verdict as a page shows it, with its interval in one column."""
+    heads = ["finding of the paper", "verdict", "effect [95 % interval]", "holds for", "unit"]
+    heads += ["seeds", "comparisons", "seeds needed", "algorithm and tasks", "remark"]
+    rows: list[list[Any]] = [
+        [v.finding.text, v.verdict, _effect(v), v.holds or None, v.finding.unit, v.seeds]
+        + [v.strata, v.needed, v.family, v.remark or None]
+        for v in verdicts
+    ]
+    return Table(heads, rows, marks=MARKS)
+
+
+def _effect(verdict: Verdict) -> Cell | None:
+    if verdict.effect is None or verdict.low is None or verdict.high is None:
+        return None
+    value, low, high = map(short, (verdict.effect, verdict.low, verdict.high))
+    return Cell(verdict.effect, f"{value} [{low}; {high}]")
+
+
 def verdicts_table(verdicts: Sequence[Verdict]) -> Table:
     """Return a row for each verdict."""
-    heads = ["finding of the paper", "verdict", "effect", "low", "high", "of", "seeds", "strata"]
-    heads += ["runs of", "remark"]
-    rows = [
-        [v.finding.text, v.verdict, v.effect, v.low, v.high, v.finding.unit]
-        + [v.seeds, v.strata, v.family or None, v.remark]
+    heads = ["finding of the paper", "verdict", "effect", "low", "high", "holds for", "unit"]
+    heads += ["seeds", "comparisons", "seeds needed", "algorithm and tasks", "remark"]
+    rows: list[list[Any]] = [
+        [v.finding.text, v.verdict, v.effect, v.low, v.high, v.holds, v.finding.unit]
+        + [v.seeds, v.strata, v.needed, v.family or None, v.remark]
         for v in verdicts
     ]
     return Table(heads, rows, marks=MARKS)

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from sb3_sparse.pages.numbers import short
 from sb3_sparse.report.data import Array
 from sb3_sparse.report.results import Results
 from sb3_sparse.report.sides import (
@@ -19,7 +20,7 @@ from sb3_sparse.report.sides import (
     sparse_and_dense,
     sparse_and_equal,
 )
-from sb3_sparse.report.statistics import difference, iqm, rectangle
+from sb3_sparse.report.statistics import Estimate, difference, iqm, rectangle, seeds_for
 
 SUPPORTED, CONTRADICTED, UNDECIDED = "supported", "contradicted", "not enough data"
 LEAST_SEEDS = 3
@@ -44,21 +45,40 @@ class Region:
     high: float = math.inf
     relative: bool = False
 
-    def verdict(self, low: float, high: float, reference: float) -> tuple[str, str]:
-        """Return the verdict on an interval, and a remark.
+    def scaled(self, reference: float) -> Region | None:
+        """Return the region in the effect's unit.
 
-        :param low: lower end of the interval
-        :param high: upper end of the interval
         :param reference: the other side's statistic
+        :return: None if the ends are shares of a statistic that is not above 0
         """
-        if self.relative and reference <= 0:
-            return UNDECIDED, NO_MARGIN
-        scale = reference if self.relative else 1.0
-        remark = f"margin {-self.low * scale:.3g}" if self.relative else ""
-        if low > self.low * scale and high < self.high * scale:
-            return SUPPORTED, remark
-        outside = high < self.low * scale or low > self.high * scale
-        return CONTRADICTED if outside else UNDECIDED, remark
+        if not self.relative:
+            return self
+        if reference <= 0:
+            return None
+        return Region(self.text, self.low * reference, self.high * reference)
+
+    def verdict(self, effect: Estimate) -> str:
+        """Return the verdict on an effect, of a region in its unit."""
+        if effect.low > self.low and effect.high < self.high:
+            return SUPPORTED
+        outside = effect.high < self.low or effect.low > self.high
+        return CONTRADICTED if outside else UNDECIDED
+
+    def needed(self, effect: Estimate) -> int | None:
+        """Return the seeds that would decide an open effect if it stays as it is.
+
+        :param effect: an effect in the region's unit
+        :return: None for more than 1,000
+        """
+        below, above = effect.value - effect.low, effect.high - effect.value
+        if self.low < effect.value < self.high:
+            ways = [(effect.value - self.low, below), (self.high - effect.value, above)]
+        elif effect.value <= self.low:
+            ways = [(self.low - effect.value, above)]
+        else:
+            ways = [(effect.value - self.high, below)]
+        share = min(room / reach for room, reach in ways if reach > 0)
+        return seeds_for(effect, share) if share > 0 else None
 
 
 GREATER = Region("supported if the interval lies above 0, contradicted if it lies below", low=0.0)
@@ -85,7 +105,7 @@ class Finding:
     :param key: its name
     :param text: the finding
     :param rule: what is compared
-    :param sides: returns the scores of both sides by stratum
+    :param sides: returns the scores of both sides by comparison
     :param region: the effects for which it holds
     :param statistic: the difference of this statistic is the effect
     :param unit: unit of the effect
@@ -110,8 +130,11 @@ class Verdict:
     :param effect: the difference of the two sides; None if there is none
     :param low: lower end of its 95 % interval
     :param high: upper end
-    :param seeds: runs of each stratum, on the scarcer side
-    :param strata: number of strata
+    :param seeds: runs of each comparison, on the scarcer side
+    :param strata: number of comparisons
+    :param needed: seeds that would decide an open verdict if the effect stays as it is; None for
+        more than 1,000, and where there is no effect
+    :param region: the effects for which the finding holds, in the effect's unit
     :param remark: why there is no verdict, or what it leaves out
 
     Example::
@@ -130,7 +153,24 @@ class Verdict:
     high: float | None = None
     seeds: int = 0
     strata: int = 0
+    needed: int | None = None
+    region: Region | None = None
     remark: str = ""
+
+    @property
+    def holds(self) -> str:
+        """The effects for which the finding holds, e.g. ``"> -0.05"``; empty without an effect."""
+        if self.region is None:
+            return ""
+        low, high = self.region.low, self.region.high
+        if math.isinf(high):
+            return f"> {short(low)}"
+        return f"< {short(high)}" if math.isinf(low) else f"{short(low)} to {short(high)}"
+
+    @property
+    def has_data(self) -> bool:
+        """Whether there are runs of both sides, however few."""
+        return bool(self.family)
 
 
 def _average(scores: Array) -> float:
@@ -143,47 +183,48 @@ FINDINGS = (
         "equal-parameters",
         "Sparse networks beat dense ones with as many parameters.",
         "Pruning, SET and RigL (their mean) minus the parameter-equivalent dense network, at all "
-        "sparsities from 50 % on; each environment and sparsity is a stratum",
+        "sparsities from 50 % on; each environment and sparsity is a comparison",
         sparse_and_equal, GREATER, iqm, IQM_UNIT,
     ),
     Finding(
         "no-loss",
         "80 to 90 % sparse networks lose nothing against the dense one of full size.",
         "Pruning, SET and RigL at 80 to 90 % (mean over methods and sparsities) minus the dense "
-        "network of full size; each environment is a stratum",
+        "network of full size; each environment is a comparison",
         sparse_and_dense, NOT_LESS, iqm, IQM_UNIT,
     ),
     Finding(
         "rigl-set",
         "RigL's gradients gain little over SET's random growth.",
-        "RigL minus SET at 50 to 95 %; each environment and sparsity is a stratum",
+        "RigL minus SET at 50 to 95 %; each environment and sparsity is a comparison",
         rigl_and_set, CLOSE, iqm, IQM_UNIT,
     ),
     Finding(
         "erk",
         "ERK is better than uniform sparsity.",
-        "ERK minus uniform, all else the same; each environment, method and sparsity is a stratum",
+        "ERK minus uniform, all else the same; each environment, method and sparsity is a "
+        "comparison",
         by_distribution, GREATER, _average, MEAN_UNIT,
     ),
     Finding(
         "critic",
         "The critic needs the parameters more than the actor.",
         "Runs whose actor has 20 % of the connections or less minus runs whose critic has, all "
-        "else the same; each environment, method and sparsity is a stratum",
+        "else the same; each environment, method and sparsity is a comparison",
         by_share, GREATER, _average, MEAN_UNIT,
     ),
     Finding(
         "weight-decay",
         "A small weight decay helps.",
         "Weight decay above 0 and up to 1e-4 minus none, all else the same; each environment, "
-        "method and sparsity is a stratum",
+        "method and sparsity is a comparison",
         by_weight_decay, GREATER, _average, MEAN_UNIT,
     ),
     Finding(
         "snr",
         "The gradients' signal-to-noise ratio falls with sparsity.",
         "Mean natural logarithm of the SNR over training at the highest sparsity minus that at the "
-        "lowest (dense is 0 %); each environment and network is a stratum",
+        "lowest (dense is 0 %); each environment and network is a comparison",
         by_snr, LESS, _average, "log SNR",
     ),
     Finding(
@@ -191,7 +232,7 @@ FINDINGS = (
         "Sparse networks bear observation noise better than dense ones with as many parameters.",
         "What the upper half of the strengths of noise costs (mean normalised return minus that "
         "without noise): sparse minus parameter-equivalent dense; each environment and sparsity "
-        "is a stratum",
+        "is a comparison",
         by_noise, GREATER, _average, MEAN_UNIT,
     ),
 )  # fmt: skip
@@ -214,23 +255,20 @@ def judge(results: Results) -> list[Verdict]:
 
 
 def _verdict(finding: Finding, family: str, sides: Sides) -> Verdict:
-    fit = [
-        stratum
-        for stratum in sides.x
-        if min(len(sides.x[stratum]), len(sides.y[stratum])) >= LEAST_SEEDS
-    ]
-    x = rectangle({stratum: sides.x[stratum] for stratum in fit}, LEAST_SEEDS)
-    y = rectangle({stratum: sides.y[stratum] for stratum in fit}, LEAST_SEEDS)
-    few = [stratum for stratum in sides.x if stratum not in fit]
+    fit = [name for name in sides.x if min(len(sides.x[name]), len(sides.y[name])) >= LEAST_SEEDS]
+    x = rectangle({name: sides.x[name] for name in fit}, LEAST_SEEDS)
+    y = rectangle({name: sides.y[name] for name in fit}, LEAST_SEEDS)
+    few = [name for name in sides.x if name not in fit]
     remark = f"fewer than {LEAST_SEEDS} seeds of both sides: {', '.join(few)}" if few else ""
     if x is None or y is None:
         return Verdict(finding, family, UNDECIDED, remark=remark)
     remark = "; ".join([*([remark] if remark else []), *dict.fromkeys((*x.remarks, *y.remarks))])
     effect = difference(x.scores, y.scores, finding.statistic)
-    reference = finding.statistic(y.scores)
-    verdict, why = finding.region.verdict(effect.low, effect.high, reference)
-    remark = "; ".join(text for text in (why, remark) if text)
+    region = finding.region.scaled(finding.statistic(y.scores))
+    verdict = UNDECIDED if region is None else region.verdict(effect)
+    needed = region.needed(effect) if region is not None and verdict == UNDECIDED else None
+    remark = "; ".join([NO_MARGIN] * (region is None) + [remark] * bool(remark))
     return Verdict(
         finding, family, verdict, effect.value, effect.low, effect.high, effect.seeds,
-        effect.tasks, remark,
+        effect.tasks, needed, region, remark,
     )  # fmt: skip

@@ -18,7 +18,8 @@ ASK = """
 <script>
 var errors = 0; window.onerror = function () { errors++; };
 window.addEventListener("load", function () {
-  var table = document.querySelectorAll("table")[1], heads = table.querySelectorAll("th");
+  var table = Array.from(document.querySelectorAll("table")).find(function (t) {
+    return t.textContent.includes("mean score"); }), heads = table.querySelectorAll("th");
   var column = Array.from(heads).findIndex(function (h) {
     return h.textContent === "mean score"; });
   function values() { return Array.from(table.tBodies[0].rows).map(function (row) {
@@ -105,7 +106,7 @@ def test_the_page_says_all_that_it_must(report):
     text = report.read_text()
     assert "<script>alert" not in text
     assert "&lt;script&gt;alert(1)&lt;/script&gt; &amp; &quot;more&quot;" in text
-    for wanted in ("no such folder", "Pending", "Mnih et al. 2015",
+    for wanted in ("no such folder", "still to be trained", "Mnih et al. 2015",
                    "torch 2.13.0", "name=\"viewport\"", "1 only counted"):  # fmt: skip
         assert wanted in text
     assert not re.search(r"""(src|href)=["'](https?:)?//""", text)
@@ -151,7 +152,7 @@ def test_runs_that_diverged_have_a_section_of_their_own(folders, tmp_path):
     for seed, status in enumerate(["finished", "diverged", "running"]):
         folders.add("rigl", 0.9, seed, status=status)
     page = write_report(folders.made, tmp_path / "out", title="T", figures=["iqm"]).read_text()
-    assert "diverged: 1; left out: 1; pending: 0." in page
+    assert "1 finished run, 1,000 environment steps; 1 diverged; 1 left out." in page
     diverged = page.split("<h2>Diverged<")[1].split("</section>")[0]
     assert "DQN on CartPole-v1, rigl 90%, seed 1: training diverged" in diverged
     assert "seed 2" not in diverged

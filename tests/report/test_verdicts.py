@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from sb3_sparse.report import FINDINGS, Results, judge, read_runs
+from sb3_sparse.report.statistics import Estimate
+from sb3_sparse.report.verdicts import GREATER as GREATER_REGION
 
 SUPPORTED, CONTRADICTED, UNDECIDED = "supported", "contradicted", "not enough data"
 
@@ -122,7 +124,10 @@ def test_a_loss_within_the_margin_is_no_loss(folders):
     pair("no-loss", 396.0, 400.0, folders, 5)
     found = verdict(folders, "no-loss")
     assert found.verdict == SUPPORTED
-    assert "margin" in found.remark
+    # 5 % of about (400 - 22) / (475 - 22), CartPole's scale
+    assert found.region.low == pytest.approx(-0.05 * 378 / 453, rel=0.02)
+    assert found.holds == "> -0.042"
+    assert found.needed is None
 
 
 def test_snr_falls_or_rises_with_sparsity(folders, tmp_path):
@@ -153,3 +158,37 @@ def test_tasks_are_strata(folders):
         seeds(folders, 3, score - 60, env_id=env_id, **EQUAL)
     found = verdict(folders, "equal-parameters")
     assert (found.verdict, found.strata, found.seeds) == (SUPPORTED, 2, 3)
+
+
+def test_an_open_verdict_tells_how_many_seeds_would_decide_it(folders):
+    for seed, score in enumerate((100.0, 480.0, 250.0, 400.0)):
+        folders.add("rigl", seed=seed, score=score)
+        folders.add("dense", None, seed=seed, score=score - 60, match=0.9)
+    found = verdict(folders, "equal-parameters")
+    assert found.verdict == UNDECIDED
+    assert found.needed > found.seeds
+
+
+@pytest.mark.parametrize(
+    ("effect", "low", "high", "share"),
+    [
+        # Student's t of 6 degrees of freedom is 2.447, by hand from a table, and sqrt(4/3) widens.
+        (0.2, -0.2, 0.6, 0.5),  # its low end must rise to 0
+        (-0.1, -0.3, 0.3, 0.25),  # its high end must fall to 0
+    ],
+)
+def test_seeds_needed_are_those_whose_interval_ends_at_the_edge(effect, low, high, share):
+    t = {4: 2.447, 9: 2.120, 10: 2.101, 32: 1.999, 33: 1.998}
+
+    def reach(seeds):
+        return t[seeds] * np.sqrt(seeds / (seeds - 1)) / np.sqrt(seeds)
+
+    found = GREATER_REGION.needed(Estimate(effect, low, high, 4))
+    assert found in t
+    assert reach(found) <= share * reach(4) * 1.001
+    assert reach(found - 1) > share * reach(4) * 0.999
+
+
+def test_an_effect_at_the_edge_needs_more_seeds_than_anyone_has():
+    assert GREATER_REGION.needed(Estimate(0.0, -0.2, 0.2, 4)) is None
+    assert GREATER_REGION.needed(Estimate(1e-4, -0.2, 0.2, 4)) is None
