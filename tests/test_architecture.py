@@ -53,7 +53,6 @@ EDGES = {
     "scipy": {"export", "intervals"},
     "ray": {"launch"},
     "sqlalchemy": {"tuning"},
-    "plotly": {"tuning"},
     "ruamel": {"tuning"},
     "sbx": {"loading"},
 }

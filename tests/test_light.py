@@ -90,7 +90,7 @@ EVERYTHING = """
 import json, logging, os, pkgutil, signal, sys, types, warnings
 from importlib import import_module
 import gymnasium, matplotlib, numpy, optuna, pandas, rl_zoo3.enjoy, rl_zoo3.train, sb3_contrib
-import stable_baselines3, torch, ale_py, mujoco, onnx, plotly.io, ray, ruamel.yaml, tensorboard
+import stable_baselines3, torch, ale_py, mujoco, onnx, ray, ruamel.yaml, tensorboard
 import rliable.library, scipy.stats, moviepy, yaml, onnxruntime, psycopg, sqlalchemy, typer, rich
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_SAMPLER
 from torch.optim import optimizer

@@ -45,6 +45,9 @@ td.open::before { content: "?  "; }
 td.good { color: light-dark(#0a6b3d, #6fd6a2); }
 td.bad { color: light-dark(#a8154f, #ff8ab8); }
 figure { margin: 1rem 0 2rem; }
+.row { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 28rem), 1fr));
+  gap: 0 1rem; }
+.row > * { min-width: 0; }
 .frame { background: #fff; border: 1px solid var(--line); border-radius: 6px;
   padding: .5rem; overflow-x: auto; }
 figure img { display: block; max-width: 100%; height: auto; margin: 0 auto; }
@@ -98,20 +101,18 @@ class Section:
         )
 
 
-def page(title: str, lead: Iterable[str], sections: Sequence[Section], script: str = "") -> str:
+def page(title: str, lead: Iterable[str], sections: Sequence[Section]) -> str:
     """Join HTML to a whole page, with a list of its sections below its lead.
 
     :param title: text
     :param lead: HTML above the contents
     :param sections: the rest of the page
-    :param script: JavaScript that the parts need
     """
-    head = f"<script>{script}</script>" if script else ""
     parts = [*lead, _contents(sections), *map(str, sections)]
     return (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{escape(title)}</title>\n<style>{STYLE}</style>{head}</head>\n"
+        f"<title>{escape(title)}</title>\n<style>{STYLE}</style></head>\n"
         f"<body>\n<h1>{escape(title)}</h1>\n"
         + "\n".join(parts)
         + f"\n<script>{SCRIPT}</script>\n</body></html>\n"
@@ -146,6 +147,11 @@ def paragraph(text: str, *links: str) -> str:
 def listing(texts: Iterable[str]) -> str:
     """Make a list of texts."""
     return "<ul>" + "".join(f"<li>{escape(text)}</li>\n" for text in texts) + "</ul>"
+
+
+def row(parts: Iterable[str]) -> str:
+    """Put parts side by side, as many as the screen has room for."""
+    return f'<div class="row">{"".join(parts)}</div>'
 
 
 def folded(summary: str, *parts: str) -> str:

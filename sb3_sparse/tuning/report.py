@@ -1,44 +1,23 @@
-"""An HTML page on searches: history, importances, slices, the best of each method; and a CSV."""
+"""An HTML page on searches, and a CSV of their trials."""
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-from sb3_sparse.errors import ConfigError, MissingExtra, SparsityError
+from sb3_sparse.errors import ConfigError, command
 from sb3_sparse.files import write_csv, written_whole
 from sb3_sparse.pages import html
-from sb3_sparse.pages.table import Table
-from sb3_sparse.tuning.backend import BaseStorage, FrozenTrial, TrialState, optuna, quiet_optuna
-from sb3_sparse.tuning.definition import Definition
-from sb3_sparse.tuning.objective import VALUES
-from sb3_sparse.tuning.search import DEFINITION, Search, folder_name
-from sb3_sparse.tuning.spaces import with_values
+from sb3_sparse.pages.plot import svg_of
+from sb3_sparse.tuning.backend import BaseStorage, TrialState, optuna, quiet_optuna
+from sb3_sparse.tuning.figures import pictures
+from sb3_sparse.tuning.search import Search, folder_name
 from sb3_sparse.tuning.storage import FOLDER, JOURNAL, open_existing
+from sb3_sparse.tuning.tables import best_by_method, best_trials
 from sb3_sparse.tuning.urls import shown_url
+from sb3_sparse.tuning.words import facts, outcome
 
-try:
-    import plotly.io
-    from optuna.visualization import (
-        plot_intermediate_values,
-        plot_optimization_history,
-        plot_param_importances,
-        plot_slice,
-    )
-except ImportError as error:
-    raise MissingExtra("reports on searches", "tune") from error
-
-TOP = 10
-HEIGHT = 420
-DIGITS = 6
-FIGURES: dict[str, Callable[[optuna.Study], Any]] = {
-    "Optimization history": plot_optimization_history,
-    "Parameter importances": plot_param_importances,
-    "Slices": plot_slice,
-    "Evaluations while training": plot_intermediate_values,
-}
+LOGS = Path("logs")
 
 
 @quiet_optuna()
@@ -52,20 +31,7 @@ def write_report(studies: Sequence[optuna.Study], storage: BaseStorage, path: Pa
     :return: the page
     :raises ConfigError: if a search has no completed trial
     """
-    searches = [Search(study) for study in studies]
-    for search in searches:
-        if not search.status().complete:
-            raise ConfigError(
-                f"no trial of {search.name!r} was completed yet, so there is nothing to report"
-            )
-    title = "Tuning: " + ", ".join(search.name for search in searches)
-    parts = [_best_by_method(searches, storage), *map(_about, searches)]
-    page = html.page(title, [], parts, script=plotly.offline.get_plotlyjs())
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with written_whole(path) as new:
-        new.write_text(page, encoding="utf-8")
-    _write_trials(searches, path.with_suffix(".csv"))
-    return path
+    return _write([Search(study) for study in studies], storage, path, [])
 
 
 @quiet_optuna()
@@ -79,96 +45,71 @@ def report_by_name(
     :return: the page
     :raises ConfigError: if a search does not exist, or has no completed trial
     """
+    options = ["--storage", shown_url(storage)] if storage else []
+    options += ["--log-folder", str(log_folder)] if log_folder != LOGS else []
+    options += ["--out", str(path)] if path else []
     storage = storage or log_folder / FOLDER / JOURNAL
     opened = open_existing(storage)
-    studies = [Search.find(opened, name, shown_url(storage)).study for name in names]
-    folder = log_folder / FOLDER / folder_name(names[0])
-    return write_report(studies, opened, path or folder / "report.html")
+    searches = [Search.find(opened, name, shown_url(storage)) for name in names]
+    path = path or log_folder / FOLDER / folder_name(names[0]) / "report.html"
+    made_by = [html.paragraph("This command draws the page:")]
+    made_by.append(html.code(command("tune", "report", *names, *options)))
+    return _write(searches, opened, path, made_by)
 
 
-def _about(search: Search) -> html.Section:
-    definition, status = search.definition, search.status()
-    pruned = len(status.done) - len(status.complete)
-    run = definition.run
-    facts = [
-        f"{run.algo.upper()} on {run.env_id}, {_what(definition, status.best)}",
-        f"{run.settings()['n_timesteps']} steps, {definition.seeds} seed(s) per trial",
-        f"sampler {definition.sampler}, pruner {definition.pruner}",
-        f"{len(status.complete)} completed, {pruned} pruned, {len(status.failed)} failed, of "
-        f"{status.planned} planned",
-    ]
-    return html.section(
-        search.name,
-        html.paragraph(f"{'; '.join(facts)}."),
-        html.subsection(f"The {TOP} best trials", _top(status.complete)),
-        *(html.subsection(title, *_figure(draw, search.study)) for title, draw in FIGURES.items()),
-    )
+def _write(
+    searches: Sequence[Search], storage: BaseStorage, path: Path, made_by: Sequence[str]
+) -> Path:
+    for search in searches:
+        if not search.status().complete:
+            raise ConfigError(
+                f"no trial of {search.name!r} was completed yet, so there is nothing to report"
+            )
+    compared, unread = best_by_method(searches, storage)
+    methods = [html.section("Best of each method", *compared)] if compared else []
+    outcomes, trials = [outcome(search) for search in searches], path.with_suffix(".csv")
+    if len(searches) == 1:
+        (about,) = map(_about, searches)
+        sections = [*(html.section(title, *content) for title, content in about), *methods]
+    else:
+        sections = [*methods, *map(_together, searches)]
+    end = [*_facts(searches), *map(html.paragraph, unread)]
+    end += [html.paragraph("Every trial:", html.link(trials.name, trials.name)), *made_by]
+    sections.append(html.section("Details", *end))
+    title = "Tuning: " + ", ".join(search.name for search in searches)
+    page = html.page(title, map(html.lead, outcomes), sections)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with written_whole(path) as new:
+        new.write_text(page, encoding="utf-8")
+    _write_trials(searches, trials)
+    return path
 
 
-def _figure(draw: Callable[[optuna.Study], Any], study: optuna.Study) -> list[str]:
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        try:
-            figure = draw(study)
-        except (ValueError, RuntimeError) as error:
-            return [html.paragraph(f"These trials do not give it: {error}")]
-    said = [w for w in caught if w.category is UserWarning]
-    figure.update_layout(height=HEIGHT, title=None, margin={"t": 30})
-    picture = plotly.io.to_html(figure, full_html=False, include_plotlyjs=False)
-    return [html.frame(picture), *(html.paragraph(f"Optuna says: {w.message}") for w in said)]
+def _about(search: Search) -> list[tuple[str, list[str]]]:
+    """Return what the page shows of a search: a table and figures, with their titles."""
+    drawn, missing = [], []
+    for one in pictures(search):
+        if one.figure is None:
+            missing.append(html.paragraph(one.caption))
+        else:
+            image = html.image(svg_of(one.figure), f"{one.title}: {one.caption}")
+            drawn.append(
+                html.figure(f"{one.name}-{search.name}", one.title, image, one.caption, [])
+            )
+    return [best_trials(search), ("Figures", [html.row(drawn), *missing])]
 
 
-def _what(definition: Definition, best: FrozenTrial | None) -> str:
-    """Return method and sparsity; a searched sparsity is that of the best trial."""
-    if definition.method == "dense":
-        return "dense"
-    run = definition.run if best is None else with_values(definition.run, best.user_attrs[VALUES])
-    sparsity = run.settings().policy_kwargs["sparsity"]
-    share = f"{100 * sparsity:.4g}%" if isinstance(sparsity, float) else str(sparsity)
-    return f"{definition.method} at {share}"
+def _together(search: Search) -> html.Section:
+    parts = [html.subsection(title, *content) for title, content in _about(search)]
+    return html.section(search.name, *parts)
 
 
-def _top(trials: Sequence[FrozenTrial]) -> str:
-    best = sorted(trials, key=lambda trial: -trial.values[0])[:TOP]
-    names = sorted({name for trial in best for name in trial.params})
-    rows = [
-        [trial.number, trial.values[0], _scores(trial), *(trial.params.get(n) for n in names)]
-        for trial in best
-    ]
-    return html.table(Table(["trial", "score", "score of each seed", *names], rows, DIGITS))
-
-
-def _scores(trial: FrozenTrial) -> str:
-    return ", ".join(f"{score:.6g}" for score in trial.user_attrs.get("scores", []))
-
-
-def _best_by_method(searches: Sequence[Search], storage: BaseStorage) -> html.Section:
-    tasks = {_task(search.definition) for search in searches}
-    rows, unread = [], []
-    for summary in storage.get_all_studies():
-        if DEFINITION not in summary.user_attrs:
-            continue
-        search = Search(optuna.load_study(storage=storage, study_name=summary.study_name))
-        try:
-            definition, status = search.definition, search.status()
-        except SparsityError as error:  # e.g. of an environment or method that is missing here
-            unread.append(html.paragraph(f"Left out: {summary.study_name}: {error}"))
-            continue
-        if _task(definition) not in tasks or status.best is None:
-            continue
-        values = status.best.user_attrs[VALUES]
-        row = [*_task(definition), _what(definition, status.best), status.best.values[0]]
-        shown = ", ".join(f"{name} {value}" for name, value in values.items())
-        row += [shown, f"{len(status.complete)} of {status.planned}", definition.seeds]
-        rows.append([*row, search.name])
-    heads = ["algorithm", "environment", "steps", "method", "best score", "with", "completed"]
-    table = Table([*heads, "seeds per trial", "search"], sorted(rows, key=str), DIGITS)
-    return html.section("Best of each method", html.table(table), *unread)
-
-
-def _task(definition: Definition) -> tuple[str, str, int]:
-    run = definition.run
-    return run.algo, run.env_id, run.settings()["n_timesteps"]
+def _facts(searches: Sequence[Search]) -> list[str]:
+    listings = [html.listing(facts(search)) for search in searches]
+    if len(searches) == 1:
+        return listings
+    names = (search.name for search in searches)
+    return [html.subsection(*one) for one in zip(names, listings, strict=True)]
 
 
 def _write_trials(searches: Sequence[Search], path: Path) -> None:

@@ -247,7 +247,7 @@ def test_an_environment_that_does_not_work_is_found_before_any_worker(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("missing", ["optuna", "ruamel.yaml", "plotly"])
+@pytest.mark.parametrize("missing", ["optuna", "ruamel.yaml", "matplotlib"])
 def test_a_missing_extra_names_its_cure(missing):
     hidden = f"import sys; sys.modules[{missing!r}] = None"
     code = f"{hidden}\nfrom sb3_sparse.tuning import tune, write_report"

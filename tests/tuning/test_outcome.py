@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import io
 import re
 import subprocess
@@ -13,16 +12,16 @@ from pathlib import Path
 import pytest
 import yaml
 from rich.console import Console
-from tuning_support import choices, small_run
+from tuning_support import choices, searched, small_run
 
 from sb3_sparse.cli.progress.tune import TuningProgress
 from sb3_sparse.errors import ConfigError
-from sb3_sparse.tuning import tune, write_report
+from sb3_sparse.tuning import tune
 from sb3_sparse.tuning.backend import TrialState, optuna
 from sb3_sparse.tuning.best import check_target, merge_best, write_best
 from sb3_sparse.tuning.report import report_by_name
 from sb3_sparse.tuning.samplers import TICKET
-from sb3_sparse.tuning.search import DEFINITION, Search
+from sb3_sparse.tuning.search import Search
 from sb3_sparse.tuning.storage import open_storage
 from sb3_sparse.tuning.tuner import define
 from sb3_sparse.zoo.configs import config_path
@@ -33,24 +32,9 @@ LOGS = Path("logs")
 SPACE = choices(weight_decay=[0.0, 1e-6, 1e-4], update_interval=[100, 200])
 
 
-def finished(storage, name, value, run=None, space=SPACE, seeds=1):
+def finished(storage, name, value, run=None, space=SPACE):
     """A study whose trials were not trained: each has the value that a function gives it."""
-    run = run or small_run()
-    definition = define(run, space, seeds, None, None, LOGS)
-    study = Search.enter(storage, name, definition, definition.trials(None)).study
-    study.sampler = definition.make_sampler()
-
-    def objective(trial):
-        sampled = definition.space.sample(trial)
-        trial.set_user_attr("hyperparams", sampled)
-        trial.set_user_attr("scores", [value(sampled)])
-        trial.report(value(sampled), 1)
-        return value(sampled)
-
-    waiting = study.get_trials(states=(TrialState.WAITING,))
-    if waiting:
-        study.optimize(objective, n_trials=len(waiting))
-    return study
+    return searched(storage, name, lambda values, _: [value(values)] * 6, run or small_run(), space)
 
 
 def decay_matters(values) -> float:
@@ -128,16 +112,8 @@ def test_a_study_needs_its_config_no_more(storage, study, tmp_path):
     path = config_of_ones_own(tmp_path)
     other = finished(storage, "other", decay_matters, small_run(conf_file=str(path)))
     path.unlink()
-    assert "<h2>mine</h2>" in report_by_name(["mine"], None, tmp_path, None).read_text()
+    assert "<h1>Tuning: mine</h1>" in report_by_name(["mine"], None, tmp_path, None).read_text()
     assert Search(other).best_entry()[0]["gamma"] == 0.99
-
-
-def test_a_study_that_cannot_be_read_here_is_named_and_spoils_no_page(storage, study, tmp_path):
-    other = finished(storage, "other", decay_matters)
-    known = other.user_attrs[DEFINITION]
-    other.set_user_attr(DEFINITION, {**known, "run": {**known["run"], "env_id": "Gone-v0"}})
-    page = write_report([study], storage, tmp_path / "page.html").read_text()
-    assert re.search("<p>Left out: other: .*Gone-v0", page)
 
 
 def test_a_link_stays_a_link_and_modes_stay(storage, tmp_path):
@@ -150,14 +126,6 @@ def test_a_link_stays_a_link_and_modes_stay(storage, tmp_path):
     assert link.is_symlink()
     assert "Tuned by" in path.read_text()
     assert path.stat().st_mode & 0o777 == 0o664
-
-
-def test_where_sparsity_is_searched_the_report_names_the_best(storage, tmp_path):
-    space = choices(sparsity=[0.5, 0.75, 0.9])
-    study = finished(storage, "s", lambda v: -abs(v["sparsity"] - 0.75), space=space)
-    page = write_report([study], storage, tmp_path / "page.html").read_text()
-    assert "rigl at 75%" in page
-    assert "rigl at 90%" not in page
 
 
 def test_what_cannot_take_the_values_is_refused_before_the_search(tmp_path):
@@ -176,37 +144,6 @@ def test_a_config_of_another_method_is_left_alone(study, tmp_path):
     with pytest.raises(ConfigError, match="by method 'set', but 'rigl' is tuned"):
         merge_best(Search(study), path)
     assert path.read_text() == config_path("set", "dqn").read_text()
-
-
-def test_the_page_and_its_csv(study, storage, tmp_path):
-    run = small_run(method="static")
-    finished(storage, "other", lambda v: -1.0, run, choices(weight_decay=[0.0]))
-    finished(storage, "elsewhere", lambda v: 7.0, small_run(env_id="Acrobot-v1"))
-    optuna.create_study(storage=storage, study_name="foreign")
-    page = write_report([study], storage, tmp_path / "page.html").read_text()
-    for title in ("Optimization history", "Parameter importances", "Slices"):
-        assert f"<h3>{title}</h3>" in page
-    assert page.count('class="plotly-graph-div"') == 4
-    assert "src=" not in page[page.index("</head>") :]  # nothing is loaded
-    table = page[page.index("<h2>Best of each method") : page.index("<h2>mine</h2>")]
-    rows = re.findall(r"<tr><td>dqn.*?</tr>", table)
-    assert len(rows) == 2
-    assert '<td>rigl at 90%</td><td class="number" data-value="99.0">99</td>' in rows[0]
-    assert '<td>static at 90%</td><td class="number" data-value="-1.0">-1</td>' in rows[1]
-
-    with (tmp_path / "page.csv").open() as file:
-        trials = list(csv.DictReader(file))
-    assert len(trials) == 6
-    for trial in trials:
-        values = {name: float(trial[name]) for name in ("weight_decay", "update_interval")}
-        assert float(trial["score"]) == pytest.approx(decay_matters(values))
-        assert (trial["study"], trial["state"], trial["evaluations"]) == ("mine", "complete", "1")
-
-
-def test_what_optuna_says_of_a_figure_stands_below_it(storage, tmp_path):
-    one = finished(storage, "one", lambda values: 1.0, space=choices(weight_decay=[0.0]))
-    page = write_report([one], storage, tmp_path / "page.html").read_text()
-    assert "<p>Optuna says: The number of trials is too small to compute importances." in page
 
 
 @pytest.mark.parametrize(

@@ -33,7 +33,7 @@ def verbosity(request):
 def test_importing_changes_neither_verbosity_nor_filters():
     code = """
 import warnings, optuna
-import torch, stable_baselines3, rl_zoo3, plotly, ruamel.yaml, sqlalchemy
+import torch, stable_baselines3, rl_zoo3, matplotlib, ruamel.yaml, sqlalchemy
 before = optuna.logging.get_verbosity(), [one for one in warnings.filters if "ptuna" in str(one)]
 import sb3_sparse.tuning
 after = optuna.logging.get_verbosity(), [one for one in warnings.filters if "ptuna" in str(one)]
