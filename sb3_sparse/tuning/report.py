@@ -100,8 +100,8 @@ def _about(search: Search) -> list[tuple[str, list[str]]]:
 
 
 def _together(search: Search) -> html.Section:
-    parts = [html.subsection(title, *content) for title, content in _about(search)]
-    return html.section(search.name, *parts)
+    (title, table), (_, figures) = _about(search)
+    return html.section(search.name, html.subsection(title, *table), *figures)
 
 
 def _facts(searches: Sequence[Search]) -> list[str]:

@@ -29,14 +29,17 @@ def outcome(search: Search) -> str:
     definition, status, best = search.definition, search.status(), best_of(search)
     run = definition.run
     own = next((one for one in status.complete if _is_as_configured(definition, one)), best)
+    trials = f"best of {len(status.done):,} trials" if len(status.done) > 1 else "only trial"
     text = (
         f"{what(definition, best)} on {run.env_id} ({run.algo.upper()}, "
-        f"{run.settings()['n_timesteps']:,} steps): the best of "
-        f"{counted(len(status.done), 'trial')} scores {score_in_words(best)}, "
-        f"with {in_words(search, best)}"
+        f"{run.settings()['n_timesteps']:,} steps): the {trials} scores {score_in_words(best)}"
     )
+    if values := in_words(search, best):
+        text += f", with {values}"
     if own.number != best.number:
-        text += f"; the config as it is, trial {own.number}, scores {score_in_words(own)}"
+        same = score_in_words(own) == score_in_words(best)
+        scores = "the same" if same else score_in_words(own)
+        text += f"; the config as it is, trial {own.number}, scores {scores}"
     elif _is_as_configured(definition, best):
         text += ", as the config has them"
     return f"{text}."
@@ -56,11 +59,11 @@ def what(definition: Definition, best: FrozenTrial) -> str:
 
 
 def in_words(search: Search, trial: FrozenTrial) -> str:
-    """Write the values of a trial, without those that all trials share."""
+    """Write the values of a trial, without those that all trials share; none leave no words."""
     fixed = search.definition.space.distributions.keys() - varied(search).keys()
     values = sorted(SearchStatus.values_of(trial).items())
     texts = (f"{spelled(name)} {value_text(value)}" for name, value in values if name not in fixed)
-    return ", ".join(texts) or "the only values that there were"
+    return ", ".join(texts)
 
 
 def score_in_words(trial: FrozenTrial) -> str:

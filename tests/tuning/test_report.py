@@ -52,6 +52,13 @@ def test_the_outcome_of_one_seed(storage):
     )
 
 
+def test_the_outcome_of_a_single_trial_has_nothing_to_choose(storage):
+    study = finished(storage, "one", lambda _: 12.345, space=choices(weight_decay=[1e-4]))
+    assert outcome(Search(study)) == (
+        "RigL at 90 % on CartPole-v1 (DQN, 600 steps): the only trial scores 12.3."
+    )
+
+
 def test_the_outcome_names_two_seeds_and_has_an_interval_of_three(storage):
     two = Search(finished(storage, "two", decay_matters, seeds=2))
     assert " scores 104 (its seeds: 99 and 109), with " in outcome(two)
@@ -74,6 +81,9 @@ def test_the_outcome_compares_with_the_config_as_it_is(storage):
     assert outcome(search).endswith(
         f"with update interval 100, weight decay 1e-6; the config as it is, trial {own}, scores 90."
     )
+    level = Search(finished(storage, "level", lambda _: 7.0, space=space))
+    texts = (", as the config has them.", ", scores the same.")
+    assert outcome(level).endswith(texts)  # by which of the equal trials came first
     best = choices(weight_decay=[1e-6, 1e-4])
     other = finished(storage, "other", lambda values: -values["weight_decay"], space=best)
     assert outcome(Search(other)).endswith(", with weight decay 1e-6, as the config has them.")
@@ -111,7 +121,7 @@ def test_the_page_and_its_csv(storage, tmp_path):
     assert rows_of(page, "best-of-each-method") == [
         ["RigL at 90\u00a0%", "<strong>99</strong>", "update interval 100, weight decay 1e-6"]
         + ["6 of 6", "mine"],
-        ["Static at 90\u00a0%", "-1", "the only values that there were", "1 of 1", "other"],
+        ["Static at 90\u00a0%", "-1", "", "1 of 1", "other"],
     ]
     assert (
         "<p>The same in all rows: algorithm DQN; environment CartPole-v1; steps 600; "

@@ -33,7 +33,7 @@ def history(search: Search) -> Picture:
     axes.scatter([best.number], [score_of(best)], s=36, color=BEST, zorder=3)
     _name(axes, best)
     axes.set(xlabel="Trial", ylabel="Score")
-    axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
+    axes.xaxis.set_major_locator(MaxNLocator(6, integer=True, min_n_ticks=1))
     texts = ["The score of each trial, and in colour the best so far."]
     if last:
         texts.append("Crosses are pruned trials, at the return of their last evaluation.")
