@@ -9,6 +9,7 @@ from sb3_sparse.pages.plot import Axes, Figure
 BEST, GREY, MEAN = "#362682", "#9a9a9a", "#222222"
 WIDTH, HEIGHT = 4.8, 3.0  # inches; this width needs no scrolling on a phone
 DPI = 144  # of what is drawn as pixels
+APART = {"wspace": 0.08}  # so that labels of panels side by side do not touch
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,7 @@ def panels(count: int, columns: int = 1, height: float = HEIGHT) -> tuple[Figure
     columns = min(columns, count)
     rows = -(-count // columns)
     figure = Figure(figsize=(WIDTH, height * rows), dpi=DPI, layout="constrained")
-    axes = list(figure.subplots(rows, columns, squeeze=False, sharey=True).flat)
+    axes = list(figure.subplots(rows, columns, squeeze=False, sharey=True, gridspec_kw=APART).flat)
     for spare in axes[count:]:
         spare.remove()
     return figure, axes[:count]
