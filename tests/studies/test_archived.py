@@ -104,8 +104,8 @@ def test_a_report_of_the_archive_is_that_of_the_folders(trained, tmp_path):
             said = other.read_bytes().replace(f" --archive {folder}/runs.jsonl".encode(), b"")
             assert said == content, path.name
     page = (tmp_path / "archive/index.html").read_text()
-    assert "Finished runs: 2;" in page
-    assert "diverged: 1; left out: 0; pending: 0." in page
+    assert "2 finished runs, 600 environment steps; 1 diverged." in page
+    assert "still to be trained" not in page
 
 
 def test_the_status_counts_what_is_in_the_archive(trained, tmp_path, capsys):
