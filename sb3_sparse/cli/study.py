@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +18,7 @@ from sb3_sparse.studies import Study
 
 if TYPE_CHECKING:
     from sb3_sparse.studies.status import CellStatus
+    from sb3_sparse.zoo.archive import Lines
 
 studies = typer.Typer(no_args_is_help=True)
 Name = Annotated[str, typer.Argument(help="A name of `study list`, or a file of your own, .yml.")]
@@ -114,19 +114,22 @@ def status(
     archive: Archive = None,
     gym_packages: GymPackages = None,
 ) -> None:
-    """Show the progress of a study, and which of its runs failed."""
+    """Show what a study has and lacks, what that costs, and what verdicts need."""
     asked = _Asked(name, scale, store, archive, gym_packages or [])
     study = asked.study()
+    from sb3_sparse.cli.missing import costs_of, findings_of
+    from sb3_sparse.studies.cost import Costs
     from sb3_sparse.studies.status import CellState, counts
 
-    statuses = asked.statuses(study)
+    lines = asked.lines()
+    statuses = asked.statuses(study, lines)
+    costs = Costs.known(store, lines)
     _say_merged(study)
     found = counts(statuses)
     say(f"{study.title}, scale {scale}: {len(statuses)} runs")
     say(", ".join(f"{number} {what}" for what, number in found.items()))
-    done = Counter(one.cell.run.env_id for one in statuses if one.state is CellState.DONE)
-    for env_id, planned in Counter(one.cell.run.env_id for one in statuses).items():
-        say(f"  {env_id}: {done[env_id]} of {planned}")
+    for line in costs_of(statuses, costs):
+        say(line)
     for one in statuses:
         if one.state in (CellState.RUNNING, CellState.STOPPED):
             say(f"{one.state}: {one.cell.name}, {one.steps} steps")
@@ -134,6 +137,8 @@ def status(
             say(f"diverged: {one.cell.name}, at step {one.steps}")
         if one.state is CellState.FAILED:
             say(f"failed: {one.cell.name}; {one.why(store)}")
+    for line in findings_of(statuses, costs):
+        say(line)
 
 
 @studies.command()
@@ -151,10 +156,10 @@ def report(
     asked = _Asked(name, scale, store, archive, gym_packages or [])
     study = asked.study()
     from sb3_sparse.report import write_report
+    from sb3_sparse.studies.status import readable
 
-    statuses = asked.statuses(study)
-    archived = {one.folder.path: one.archived for one in statuses if one.archived is not None}
-    folders = [one.folder.path for one in statuses if one.folder.path.is_dir()]
+    statuses = asked.statuses(study, asked.lines())
+    folders, archived = readable(statuses)
     if not folders and not archived:
         where = store if archive is None else f"{store} or {archive}"
         raise ConfigError(
@@ -208,11 +213,14 @@ class _Asked:
     def study(self) -> Study:
         return Study.read(self.name, self.scale, self.packages)
 
-    def statuses(self, study: Study) -> list[CellStatus]:
-        from sb3_sparse.studies import status_of
+    def lines(self) -> Lines:
         from sb3_sparse.zoo.archive import Archive
 
-        lines = None if self.archive is None else Archive(self.archive).read()
+        return {} if self.archive is None else Archive(self.archive).read()
+
+    def statuses(self, study: Study, lines: Lines) -> list[CellStatus]:
+        from sb3_sparse.studies import status_of
+
         return [status_of(cell, self.store, lines) for cell in study.cells]
 
     def command(self, what: str, *more: str) -> str:

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from sb3_sparse.report.measured import Rows
 from sb3_sparse.report.methods import DENSE, EQUAL
-from sb3_sparse.zoo.clock import seconds_in
+from sb3_sparse.zoo.clock import computed_in
 from sb3_sparse.zoo.environments import suite_of
 from sb3_sparse.zoo.record import Record, Status
 from sb3_sparse.zoo.results import score_of
@@ -153,14 +153,8 @@ class RunData:
 
     @property
     def seconds(self) -> float | None:
-        """The seconds that it trained, without evaluations; None if its record lacks them.
-
-        Those of the processor, which other processes do not change, or on a GPU those that passed.
-        """
-        found = seconds_in(self.record)
-        if found is None:
-            return None
-        return found.processor if self.record.get("device", "cpu") == "cpu" else found.wall
+        """The seconds that it computed, without evaluations; None if its record lacks them."""
+        return computed_in(self.record)
 
     @property
     def layers(self) -> list[dict[str, Any]]:

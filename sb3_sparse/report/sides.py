@@ -18,6 +18,7 @@ SMALL_DECAY, SMALL_SHARE = 1e-4, 0.2
 ROUNDING = 0.005
 Scores = Mapping[str, list[float]]
 Valued = tuple[RunData, float]
+Pairs = Mapping[str, list[Valued]]
 Which = Callable[[RunData], bool]
 
 
@@ -28,11 +29,13 @@ class Sides:
     :param x: scores of the one side by stratum, one per seed
     :param y: scores of the other side
     :param why: what is missing if there is no stratum
+    :param runs: the runs whose scores they are
     """
 
     x: Scores = field(default_factory=dict)
     y: Scores = field(default_factory=dict)
     why: str = ""
+    runs: tuple[RunData, ...] = ()
 
 
 def sparse_and_equal(results: Results, family: str) -> Sides:
@@ -121,13 +124,13 @@ def by_snr(results: Results, family: str) -> Sides:
                 logs = [math.log(value) for _, value in points if value > 0]
                 if logs:
                     found[f"{run.env_id}, {network}"].append((run, fmean(logs)))
-    x, y = {}, {}
+    high, low = {}, {}
     for stratum, pairs in sorted(found.items()):
         levels = {run.level for run, _ in pairs}
         if len(levels) > 1:
-            x[stratum] = _by_seed([pair for pair in pairs if pair[0].level == max(levels)])
-            y[stratum] = _by_seed([pair for pair in pairs if pair[0].level == min(levels)])
-    return Sides(x, y, f"no {SNR} at two sparsities")
+            high[stratum] = [pair for pair in pairs if pair[0].level == max(levels)]
+            low[stratum] = [pair for pair in pairs if pair[0].level == min(levels)]
+    return _both(high, low, {one: one for one in high}, f"no {SNR} at two sparsities")
 
 
 def by_noise(results: Results, family: str) -> Sides:
@@ -173,11 +176,17 @@ def _sides(
     """Split scored runs into two sides, over the strata that both have."""
     left, right = (_by_stratum((p for p in pairs if side(p[0])), stratum) for side in (x, y))
     both = sorted(left.keys() & right.keys())
-    names = _short(both)
+    return _both(left, right, _short(both), why)
+
+
+def _both(x: Pairs, y: Pairs, names: Mapping[str, str], why: str) -> Sides:
+    """Make both sides of scored runs, over the strata that have a name."""
+    runs = [run for side in (x, y) for one in names for run, _ in side[one]]
     return Sides(
-        {names[one]: _by_seed(left[one]) for one in both},
-        {names[one]: _by_seed(right[one]) for one in both},
+        {name: _by_seed(x[one]) for one, name in names.items()},
+        {name: _by_seed(y[one]) for one, name in names.items()},
         why,
+        tuple(dict.fromkeys(runs)),
     )
 
 

@@ -114,3 +114,9 @@ def counts(statuses: Sequence[CellStatus]) -> dict[CellState, int]:
     """Count the cells in each state."""
     found = Counter(one.state for one in statuses)
     return {state: found[state] for state in CellState}
+
+
+def readable(statuses: Sequence[CellStatus]) -> tuple[list[Path], dict[Path, Archived]]:
+    """Return what a report on cells reads: folders that exist, and archived runs by folder."""
+    folders = [one.folder.path for one in statuses if one.folder.path.is_dir()]
+    return folders, {one.folder.path: one.archived for one in statuses if one.archived is not None}

@@ -89,3 +89,17 @@ def seconds_in(record: Record) -> Seconds | None:
         if not all(is_finite(one) and one >= 0 for one in (found.wall, found.processor)):
             raise CorruptStateError(f"{record.source} is damaged: its seconds are {entry!r}")
         return found
+
+
+def computed_in(record: Record) -> float | None:
+    """Read from a record how many seconds its run computed; None in records of older versions.
+
+    Those of the processor, which other processes do not change, or on a GPU those that passed.
+    Evaluations and checkpoints are not among them.
+
+    :raises CorruptStateError: if the record is damaged
+    """
+    found = seconds_in(record)
+    if found is None:
+        return None
+    return found.processor if record.get("device", "cpu") == "cpu" else found.wall

@@ -192,3 +192,27 @@ def test_seeds_needed_are_those_whose_interval_ends_at_the_edge(effect, low, hig
 def test_an_effect_at_the_edge_needs_more_seeds_than_anyone_has():
     assert GREATER_REGION.needed(Estimate(0.0, -0.2, 0.2, 4)) is None
     assert GREATER_REGION.needed(Estimate(1e-4, -0.2, 0.2, 4)) is None
+
+
+def test_the_sides_name_the_runs_that_they_are_made_of(folders):
+    seeds(folders, 3, HIGH)
+    seeds(folders, 3, LOW, **EQUAL)
+    taken = set(folders.made)
+    seeds(folders, 3, HIGH, method="static")
+    seeds(folders, 3, HIGH, sparsity=0.5)  # beside no dense network of equal size
+    runs, _ = read_runs(folders.made)
+    (finding,) = [one for one in FINDINGS if one.key == "equal-parameters"]
+    results = Results(tuple(runs))
+    (family,) = results.families()
+    assert {run.folder for run in finding.sides(results, family).runs} == taken
+
+
+def test_the_runs_of_snr_are_those_of_the_highest_and_the_lowest_sparsity(folders):
+    pair("snr", 0.1, 0.2, folders, 3)
+    taken = set(folders.made)
+    for seed in range(3):
+        folders.add(sparsity=0.5, seed=seed, snr={"snr/q_net": 0.15, "snr/q_net/active": 1.0})
+    runs, _ = read_runs(folders.made)
+    (finding,) = [one for one in FINDINGS if one.key == "snr"]
+    results = Results(tuple(runs))
+    assert {run.folder for run in finding.sides(results, *results.families()).runs} == taken
