@@ -12,6 +12,7 @@ try:
     import typer
     from rich.console import Console
 
+    from sb3_sparse.cli.card import card_command
     from sb3_sparse.cli.compress import compress_command
     from sb3_sparse.cli.export import ExportCommand, export_command
     from sb3_sparse.cli.look import enjoy_command, inspect_command
@@ -32,6 +33,7 @@ app = typer.Typer(
 app.command("train", context_settings=MORE_VALUES)(train_command)
 app.command("enjoy")(enjoy_command)
 app.command("inspect")(inspect_command)
+app.command("card")(card_command)
 app.command("compress")(compress_command)
 app.command("export", cls=ExportCommand)(export_command)
 app.add_typer(tuning, name="tune", help="Search hyperparameters with Optuna, and report.")

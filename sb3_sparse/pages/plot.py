@@ -40,11 +40,13 @@ __all__ = [
     "line",
     "logarithmic",
     "save",
+    "save_png",
     "styled",
     "svg_of",
 ]
 WIDTH, HEIGHT, COLUMNS = 3.4, 2.7, 3
 SPARE = 0.5
+DOTS = 150  # of a PNG, for each inch
 ENTRY, LETTER = 0.6, 0.075  # inches of a legend's column: its mark, and a letter of its text
 STYLE: Any = {
     "font.size": 9,
@@ -188,11 +190,16 @@ def svg_of(figure: Figure) -> bytes:
     return content.getvalue()
 
 
+def save_png(path: Path, figure: Figure) -> None:
+    """Write a figure as PNG; the same bytes each time."""
+    with written_whole(path) as new, styled():
+        figure.savefig(new, format="png", dpi=DOTS)
+
+
 def save(name: str, drawing: Drawing, folder: Path) -> None:
     """Write ``<name>.png``, ``<name>.svg`` and ``<name>.csv``; the same bytes each time."""
     folder.mkdir(parents=True, exist_ok=True)
     with written_whole(folder / f"{name}.svg") as new:
         new.write_bytes(svg_of(drawing.figure))
-    with written_whole(folder / f"{name}.png") as new, styled():
-        drawing.figure.savefig(new, format="png", dpi=150)
+    save_png(folder / f"{name}.png", drawing.figure)
     write_csv(folder / f"{name}.csv", drawing.heads, drawing.rows, digits=8)

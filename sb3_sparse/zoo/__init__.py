@@ -8,6 +8,7 @@ from sb3_sparse.lazy import lazily
 
 if TYPE_CHECKING:
     from sb3_sparse.zoo.archive import Archive
+    from sb3_sparse.zoo.card import Card
     from sb3_sparse.zoo.configs import config_path
     from sb3_sparse.zoo.folder import RunFolder
     from sb3_sparse.zoo.inspection import inspect_model
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Archive",
+    "Card",
     "Outcome",
     "Record",
     "RunFolder",

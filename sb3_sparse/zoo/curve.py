@@ -1,0 +1,31 @@
+"""The learning curve of a run, as a picture."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sb3_sparse.intervals import Array
+from sb3_sparse.pages.look import Look
+from sb3_sparse.pages.plot import Drawing, Sheet, styled
+
+HEADS = ("timesteps", "mean", "low", "high", "episodes")
+LOOK = Look("#0072b2", "o", "-")
+
+
+def curve(title: str, timesteps: Array, returns: Array) -> Drawing:
+    """Draw the mean return of each evaluation, with a band of a standard deviation over episodes.
+
+    :param timesteps: environment steps before each evaluation, shape ``[evaluations]``
+    :param returns: episode returns, shape ``[evaluations, episodes]``
+    """
+    mean, spread = returns.mean(axis=1), returns.std(axis=1)
+    spread = np.where(returns.shape[1] > 1, spread, np.nan)  # one episode has no band
+    with styled():
+        sheet = Sheet(HEADS, 1)
+        (axes,) = sheet.axes
+        steps = [int(step) for step in timesteps]
+        ends = (mean, mean - spread, mean + spread)
+        sheet.line(axes, [], steps, ends, [returns.shape[1]], LOOK, "")
+        axes.set(title=title, xlabel="environment steps", ylabel="mean return")
+        axes.ticklabel_format(axis="x", style="sci", scilimits=(-3, 4))
+        return sheet.drawing()
