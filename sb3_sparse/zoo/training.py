@@ -37,6 +37,7 @@ from sb3_sparse.zoo.saved import EVALUATION_ENVS
 from sb3_sparse.zoo.settings import Settings
 from sb3_sparse.zoo.spec import RunSpec
 from sb3_sparse.zoo.validation import check_settings
+from sb3_sparse.zoo.versions import continued, versions
 from sb3_sparse.zoo.watch import Watch
 
 
@@ -143,6 +144,7 @@ def resume(
                     f"{record.source} is damaged: its settings lack n_timesteps; {CURE}"
                 )
             tensorboard_log = str(record["tensorboard_log"])
+            before = {name: str(one) for name, one in record.get("versions", {}).items()}
         start = own.start()
         place = start.folder or "its start"
         failure = f"nothing was changed: the run in {own} cannot resume from {place}"
@@ -157,6 +159,8 @@ def resume(
                 stack.enter_context(restored_monitors(own.path, start.folder))
             manager = RunManager(run, settings, own, evaluation, start, tensorboard_log)
             model = manager.setup()
+        if not start.trained:
+            own.write(versions=versions() if start.folder is None else continued(before))
         watch = watch or Watch()
         watch.begins(own.path, None)
         return _Session(run, manager, model, callbacks, watch).outcome()

@@ -6,12 +6,14 @@ import json
 import os
 import platform
 import subprocess
+from collections.abc import Mapping
 from importlib.metadata import Distribution, PackageNotFoundError, distribution, version
 from pathlib import Path
 
 NAME = "sb3-sparse"
 PACKAGES = (NAME, "stable-baselines3", "sb3-contrib", "rl_zoo3", "torch", "gymnasium", "numpy")
 DIGITS = 12
+UNKNOWN, THEN = "unknown", ", then "
 TIMEOUT = 5.0
 """Seconds after which git has failed."""
 
@@ -43,6 +45,18 @@ def versions() -> dict[str, str]:
         except PackageNotFoundError:
             continue
     return found if COMMIT is None else {**found, "commit": COMMIT}
+
+
+def continued(before: Mapping[str, str]) -> dict[str, str]:
+    """Return the versions of a run that this process continues, e.g. ``"2.12.0, then 2.13.0"``.
+
+    :param before: its versions so far; a name that it lacks was unknown
+    """
+    found = {**before}
+    for name, now in versions().items():
+        known = before.get(name, UNKNOWN)
+        found[name] = known if known.split(THEN)[-1] == now else f"{known}{THEN}{now}"
+    return found
 
 
 def _by_metadata(installed: Distribution, package: Path) -> str | None:

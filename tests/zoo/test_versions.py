@@ -10,10 +10,13 @@ from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 
 import pytest
+from zoo.test_train import DQN_RUN, Stop
 
 from sb3_sparse.zoo import versions
+from sb3_sparse.zoo.folder import RunFolder
 from sb3_sparse.zoo.prepare import prepare
 from sb3_sparse.zoo.spec import RunSpec
+from sb3_sparse.zoo.training import resume, train
 from sb3_sparse.zoo.versions import commit_of
 
 pytestmark = pytest.mark.skipif(shutil.which("git") is None, reason="needs git")
@@ -181,3 +184,50 @@ def test_the_record_has_the_commit_or_lacks_it(tmp_path, monkeypatch, commit):
     assert {"python", "sb3-sparse", "torch"} <= set(found)
     assert found.get("commit") == commit
     assert ("commit" in found) == (commit is not None)
+
+
+FIRST, SECOND = "0123456789ab", "ba9876543210"
+
+
+@pytest.mark.parametrize(
+    ("before", "now", "after"),
+    [
+        (FIRST, FIRST, FIRST),
+        (FIRST, SECOND, f"{FIRST}, then {SECOND}"),
+        (f"{FIRST}, then {SECOND}", SECOND, f"{FIRST}, then {SECOND}"),
+        (f"{FIRST}, then {SECOND}", FIRST, f"{FIRST}, then {SECOND}, then {FIRST}"),
+        (None, FIRST, f"unknown, then {FIRST}"),  # began by an older version
+        (FIRST, None, FIRST),
+    ],
+)
+def test_a_continued_run_has_the_commits_of_all_its_processes(monkeypatch, before, now, after):
+    monkeypatch.setattr(versions, "COMMIT", now)
+    known = {**versions.versions(), "torch": "0.1"}
+    known.pop("commit", None)
+    if before is not None:
+        known["commit"] = before
+    found = versions.continued(known)
+    assert found["commit"] == after
+    assert found["torch"] == f"0.1, then {versions.version('torch')}"
+    assert found["python"] == known["python"]
+
+
+def test_a_resumed_run_names_both_commits(tmp_path, monkeypatch):
+    monkeypatch.setattr(versions, "COMMIT", FIRST)
+    stopped = train(DQN_RUN, tmp_path, [Stop(500)])
+    monkeypatch.setattr(versions, "COMMIT", SECOND)
+    resume(stopped.folder)
+    record = RunFolder(stopped.folder).record()
+    assert (record["status"], record["versions"]["commit"]) == (
+        "finished",
+        f"{FIRST}, then {SECOND}",
+    )
+
+
+def test_a_run_that_begins_anew_names_the_second_alone(tmp_path, monkeypatch):
+    monkeypatch.setattr(versions, "COMMIT", FIRST)
+    stopped = train(DQN_RUN, tmp_path, [Stop(500)])
+    RunFolder(stopped.folder).clear_checkpoints()
+    monkeypatch.setattr(versions, "COMMIT", SECOND)
+    resume(stopped.folder)
+    assert RunFolder(stopped.folder).record()["versions"]["commit"] == SECOND
