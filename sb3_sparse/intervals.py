@@ -13,10 +13,10 @@ Array = npt.NDArray[np.float64]
 CONFIDENCE = 0.95
 
 
-def t_quantile(freedom: int) -> float:
+def t_quantile(freedom: float) -> float:
     """Return by how many standard errors a 95 % interval reaches to either side.
 
-    :param freedom: degrees of freedom, 1 or more
+    :param freedom: degrees of freedom, above 0
     """
     try:
         from scipy.special import stdtrit

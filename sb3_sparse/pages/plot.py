@@ -1,9 +1,9 @@
-"""Figures of pages in one style: panels, lines with bands, one legend; and how they are written."""
+"""Figures of pages in one style: sheets of panels with one legend; and how they are written."""
 
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,24 +11,29 @@ from typing import Any
 
 import numpy as np
 
-from sb3_sparse.errors import MissingExtra
 from sb3_sparse.files import write_csv, written_whole
-from sb3_sparse.intervals import Array
+from sb3_sparse.pages.backend import (
+    Axes,
+    Figure,
+    Line2D,
+    MaxNLocator,
+    Patch,
+    PercentFormatter,
+    matplotlib,
+)
+from sb3_sparse.pages.lines import (
+    BAND,
+    RUN,
+    SEED,
+    THIN,
+    Ends,
+    curve,
+    heights_of,
+    line,
+    logarithmic,
+    points,
+)
 from sb3_sparse.pages.look import Look
-
-try:
-    import matplotlib
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-    from matplotlib.ticker import (
-        EngFormatter,
-        LogLocator,
-        MaxNLocator,
-        NullFormatter,
-        PercentFormatter,
-    )
-except ImportError as error:
-    raise MissingExtra("drawing figures", "report") from error
 
 __all__ = [
     "Axes",
@@ -37,29 +42,42 @@ __all__ = [
     "MaxNLocator",
     "PercentFormatter",
     "Sheet",
+    "curve",
     "line",
     "logarithmic",
+    "points",
     "save",
     "save_png",
     "styled",
     "svg_of",
 ]
 WIDTH, HEIGHT, COLUMNS = 3.4, 2.7, 3
+NARROWEST = 4.6
 SPARE = 0.5
 DOTS = 150  # of a PNG, for each inch
-ENTRY, LETTER = 0.6, 0.075  # inches of a legend's column: its mark, and a letter of its text
+ENTRY, LETTER, LINE = 0.6, 0.085, 0.21  # inches: a legend's mark, a letter, a line of text
+TEXT, LEAST_GAP = 10, 13  # points
+GREY = "#6a6a6a"
 STYLE: Any = {
-    "font.size": 9,
-    "axes.titlesize": 9,
+    "font.size": TEXT,
+    "axes.titlesize": TEXT,
+    "axes.labelsize": TEXT,
+    "xtick.labelsize": TEXT,
+    "ytick.labelsize": TEXT,
+    "legend.fontsize": TEXT,
+    "figure.titlesize": 11,
+    "figure.titleweight": "bold",
+    "figure.labelsize": TEXT,
     "axes.spines.top": False,
     "axes.spines.right": False,
+    "axes.edgecolor": "#555555",
     "axes.grid": True,
     "grid.color": "#e6e6e6",
     "grid.linewidth": 0.6,
     "axes.axisbelow": True,
     "legend.frameon": False,
     "lines.linewidth": 1.4,
-    "lines.markersize": 5,
+    "lines.markersize": 4.8,
     "svg.hashsalt": "sb3-sparse",
     "svg.fonttype": "path",
     "font.family": "DejaVu Sans",
@@ -94,27 +112,44 @@ class Sheet:
     :param count: number of panels
     :param columns: panels in a row
     :param height: height of a row, in inches
+    :param width: width of a column, in inches
+    :param title: what all panels have in common
+    :param x: the label that all panels share below
+    :param y: the label that all panels share at the left
+    :param band: what bands are
     """
 
     def __init__(
-        self, heads: Sequence[str], count: int, columns: int = COLUMNS, height: float = HEIGHT
+        self,
+        heads: Sequence[str],
+        count: int,
+        columns: int = COLUMNS,
+        height: float = HEIGHT,
+        *,
+        width: float = WIDTH,
+        title: str = "",
+        x: str = "",
+        y: str = "",
+        band: str = "95 % interval",
     ) -> None:
-        columns = min(columns, count)
-        rows = -(-count // columns)
-        size = (max(WIDTH * columns, 4.6), height * rows + 0.5)
+        self.band = band
+        self.columns = min(columns, count)
+        rows = -(-count // self.columns)
+        size = (max(width * self.columns, NARROWEST), height * rows + LINE * bool(title))
         self.figure = Figure(figsize=size, layout="constrained")
-        axes = list(self.figure.subplots(rows, columns, squeeze=False).flat)
+        axes = list(self.figure.subplots(rows, self.columns, squeeze=False).flat)
         for spare in axes[count:]:
             spare.remove()
         self.axes: list[Axes] = axes[:count]
         self.heads, self.rows = heads, list[Sequence[Any]]()
+        self.title, self.x, self.y = title, x, y
 
     def line(
         self,
         axes: Axes,
         place: Sequence[Any],
         x: Sequence[float],
-        ends: tuple[Array, Array, Array],
+        ends: Ends,
         counts: Sequence[int],
         look: Look,
         label: str,
@@ -125,61 +160,119 @@ class Sheet:
         :param ends: mean, and lower and upper end of the interval, each of the shape of ``x``
         :param counts: what ends each of the rows: the seeds, and the tasks if there are several
         """
-        for at, *values in zip(x, *ends, strict=True):
-            self.rows.append([*place, at, *map(float, values), *counts])
+        self.note(place, x, ends, counts)
         line(axes, x, ends, look, label)
 
+    def note(
+        self, place: Sequence[Any], x: Sequence[Any], ends: Ends, counts: Sequence[int]
+    ) -> None:
+        """Add the rows of a line."""
+        for at, *values in zip(x, *ends, strict=True):
+            self.rows.append([*place, at, *map(float, values), *counts])
+
     def drawing(self, remarks: Sequence[str] = ()) -> Drawing:
-        """Finish the figure with one legend below all panels, and panels as high as their lines."""
-        found: dict[str, Any] = {}
-        for one in self.axes:
-            _limit(one)
-            for handle, label in zip(*one.get_legend_handles_labels(), strict=True):
-                found.setdefault(label, handle)
+        """Finish the figure: its labels, one legend, and panels as high as their lines."""
+        for group in _groups(self.axes):
+            _limit(group)
+        if self.title:
+            self.figure.suptitle(self.title, x=0.01, ha="left")
+        if self.y:
+            self.figure.supylabel(self.y)
+        found = (
+            {}
+            if len(self.axes) == self.columns
+            and _label_ends(self.axes[-1], self.figure.get_figheight())
+            else self._key()
+        )
+        entry = ENTRY + LETTER * max(map(len, found), default=0)
+        width = self.figure.get_figwidth()
+        across = max(1, min(len(found), int(width / entry)))
+        strip = LINE * -(-len(found) // across) + 0.06 * bool(found)
+        below = strip + LINE * bool(self.x)
+        if below:
+            height = self.figure.get_figheight() + below
+            self.figure.set_figheight(height)
+            engine: Any = self.figure.get_layout_engine()
+            engine.set(rect=(0, below / height, 1, 1 - below / height))
+            if self.x:
+                self.figure.supxlabel(self.x, y=strip / height + 0.02 / height, va="bottom")
         if found:
-            entry = ENTRY + LETTER * max(map(len, found))
-            columns = max(1, int(self.figure.get_figwidth() / entry))
             self.figure.legend(
-                list(found.values()), list(found), loc="outside lower center",
-                ncols=min(columns, len(found)),
+                list(found.values()), list(found), loc="lower center", bbox_to_anchor=(0.5, 0),
+                ncols=across, borderaxespad=0.1, borderpad=0.1, columnspacing=1.5,
             )  # fmt: skip
         return Drawing(self.figure, self.heads, self.rows, remarks)
 
+    def _key(self) -> dict[str, Any]:
+        """Return what the legend shows: the labelled lines, and what thin lines and bands are."""
+        found: dict[str, Any] = {}
+        marks = set()
+        for one in self.axes:
+            for handle, label in zip(*one.get_legend_handles_labels(), strict=True):
+                found.setdefault(label, handle)
+            for artist in one.get_children():
+                if artist.get_gid() in (SEED, RUN, BAND):
+                    dotted = isinstance(artist, Line2D) and artist.get_linestyle() == "None"
+                    marks.add((artist.get_gid(), dotted))
+        for each in (SEED, RUN):
+            kinds = {dotted for mark, dotted in marks if mark == each}
+            if kinds:
+                found[f"one {each}"] = Line2D(
+                    [], [], color=GREY, linewidth=THIN, alpha=0.9, markersize=3,
+                    linestyle="-" if False in kinds else "", marker="o" if True in kinds else "",
+                )  # fmt: skip
+        if (BAND, False) in marks:
+            found[self.band] = Patch(color=GREY, alpha=0.25, linewidth=0)
+        return found
 
-def line(
-    axes: Axes, x: Sequence[float], ends: tuple[Array, Array, Array], look: Look, label: str
-) -> None:
-    """Draw a mean with its interval as a band, or without a band if there is no interval."""
-    middle, low, high = ends
-    every = max(1, len(x) // 8)
-    axes.plot(
-        x, middle, color=look.color, linestyle=look.line, marker=look.marker, markevery=every,
-        label=label,
-    )  # fmt: skip
-    if not np.isnan(low).all():
-        axes.fill_between(x, low, high, color=look.color, alpha=0.15, linewidth=0)
+
+def _groups(axes: Iterable[Axes]) -> list[list[Axes]]:
+    """Group panels that share their y axis."""
+    found: list[list[Axes]] = []
+    for one in axes:
+        if not any(one in group for group in found):
+            found.append(list(one.get_shared_y_axes().get_siblings(one)))
+    return found
 
 
-def _limit(one: Axes) -> None:
-    """Show lines whole but cut high bands: one of two seeds reaches 13 standard errors."""
-    drawn = [np.asarray(artist.get_ydata(), dtype=np.float64) for artist in one.get_lines()]
-    long = [values for values in drawn if not np.array_equal(values, [0, 1])]  # vertical lines
-    if not long or one.get_yscale() == "log":
+def _limit(group: Sequence[Axes]) -> None:
+    """Show lines whole but cut high bands of panels that share their y axis."""
+    one = group[0]
+    values = np.concatenate([heights_of(axes) for axes in group])
+    if not len(values) or one.get_yscale() == "log" or not one.get_autoscaley_on():
         return
-    values = np.concatenate(long)
-    low, high = float(np.nanmin(values)), float(np.nanmax(values))
+    low, high = float(values.min()), float(values.max())
     spare = SPARE * ((high - low) or abs(high) or 1.0)
     bottom, top = one.get_ylim()
     one.set_ylim(max(bottom, low - spare), min(top, high + spare))
 
 
-def logarithmic(one: Axes, which: str) -> None:
-    """Make an axis logarithmic, with labels over less than a decade, too: 500, 1k, 2k."""
-    axis = one.xaxis if which == "x" else one.yaxis
-    (one.set_xscale if which == "x" else one.set_yscale)("log")
-    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=8))
-    axis.set_major_formatter(EngFormatter(sep="") if which == "x" else "{x:g}")
-    axis.set_minor_formatter(NullFormatter())
+def _label_ends(one: Axes, high: float) -> bool:
+    """Write the names of lines at their ends if they stand far enough apart; else do nothing.
+
+    :param high: height of the figure, in inches
+    """
+    ends = []
+    for artist in one.get_lines():
+        x, y = (np.asarray(values, dtype=np.float64) for values in artist.get_data())
+        label = str(artist.get_label())
+        if not label.startswith("_") and len(x):
+            last = int(np.argmax(x))
+            ends.append((label, x[last], y[last], artist.get_color()))
+    if len(ends) < 2:
+        return False
+    points_high = 72 * (one.get_position().height * high)
+    shown = [one.transAxes.inverted().transform(one.transData.transform((x, y)))
+             for _, x, y, _ in ends]  # fmt: skip
+    heights = sorted(points_high * y for _, y in shown)
+    if np.diff(heights).min() < LEAST_GAP or np.ptp([x for x, _ in shown]) > 0.02:
+        return False
+    for label, x, y, color in ends:
+        one.annotate(
+            label, (x, y), xytext=(7, 0), textcoords="offset points", va="center",
+            color=[0.7 * part for part in matplotlib.colors.to_rgb(color)], annotation_clip=False,
+        )  # fmt: skip
+    return True
 
 
 def svg_of(figure: Figure) -> bytes:

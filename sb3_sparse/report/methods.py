@@ -7,28 +7,26 @@ from sb3_sparse.pages.names import METHODS
 
 DENSE, EQUAL = "dense", "dense-equal"
 NAMES = {
-    DENSE: "Dense: 100 %",
+    DENSE: "Dense",
     EQUAL: "Dense, equal parameters",
     **METHODS,
 }
 
 
-# Colours and markers are the paper's (IBM's colour-blind-safe palette) for what it compares. Line
-# styles are added, so that no line is told by its colour alone.
+# Colours are the paper's (IBM's colour-blind-safe palette) for what it compares, dense networks of
+# full size are grey. Markers and line styles differ, so that no line is told by its colour alone.
 LOOKS = {
-    DENSE: Look("#444444", "X", "--"),
+    DENSE: Look("#6E6E6E", "X", "--"),
     EQUAL: Look("#648FFF", "s", "-."),
     "prune": Look("#DC267F", "D", ":"),
-    "static": Look("#FFB000", ">", (0, (5, 1))),
-    "set": Look("#FE6100", "<", "--"),
+    "static": Look("#FFB000", "p", (0, (5, 1))),
+    "set": Look("#FE6100", "P", "--"),
     "rigl": Look("#362682", "o", "-"),
-    "granet": Look("#117733", "^", "-."),
-    "mst": Look("#882255", "v", "--"),
-    "rlx2": Look("#44AA99", "P", (0, (3, 1, 1, 1))),
+    "granet": Look("#117733", "h", "-."),
+    "mst": Look("#882255", "D", "--"),
+    "rlx2": Look("#44AA99", "s", (0, (3, 1, 1, 1))),
 }
-OTHERS = (Look("#009E73", "^", "-"), Look("#56B4E9", "v", "--"), Look("#7F7F7F", "P", ":"))
-# For levels of sparsity, budgets and regimes, from much to little; distinct in grey, too.
-SHADES = ("#000000", "#785EF0", "#DC267F", "#FE6100", "#FFB000", "#009E73", "#56B4E9", "#999999")
+OTHERS = (Look("#009E73", "p", "-"), Look("#56B4E9", "h", "--"), Look("#9A6324", "P", ":"))
 
 
 def name_of(label: str) -> str:
@@ -41,15 +39,6 @@ def look_of(label: str) -> Look:
     if label in LOOKS:
         return LOOKS[label]
     return OTHERS[sum(label.encode()) % len(OTHERS)]
-
-
-def shaded(label: str, place: int) -> Look:
-    """Return a method's marker and line style in the colour of a level.
-
-    :param place: place of the level among those that the figure compares
-    """
-    look = look_of(label)
-    return Look(SHADES[place % len(SHADES)], look.marker, look.line)
 
 
 def in_order(labels: set[str]) -> list[str]:

@@ -15,7 +15,7 @@ from sb3_sparse.report.statistics import LEAST, rectangle
 class Panel:
     """Normalised scores of the methods of one family at one sparsity.
 
-    :param family: algorithm, architecture and suite
+    :param family: algorithm and tasks
     :param level: sparsity
     :param scores: arrays of shape ``[runs, tasks]``, by method
     :param tasks: the columns
@@ -25,11 +25,6 @@ class Panel:
     level: float
     scores: Mapping[str, Array]
     tasks: Sequence[str]
-
-    @property
-    def title(self) -> str:
-        """Family, sparsity and number of tasks."""
-        return f"{self.family}\n{percent(self.level)}, {len(self.tasks)} task(s)"
 
 
 def panels_of(results: Results) -> tuple[list[Panel], list[str]]:

@@ -122,10 +122,21 @@ def improvement(better: Array, worse: Array, reps: int = REPS) -> Estimate:
     """
 
     def probability(x: Array, y: Array) -> Array:  # rliable's metric, without a test per task
-        above, same = x[:, None] > y[None], x[:, None] == y[None]
-        return np.array([(above + 0.5 * same).mean()])
+        return np.array([chances(x, y).mean()])
 
     return _bootstrap((better, worse), probability, reps)
+
+
+def chances(better: Array, worse: Array) -> Array:
+    """Return for each run of one method which share of another's runs it beats, ties half.
+
+    :param better: shape ``[runs, tasks]``
+    :param worse: shape ``[runs, tasks]``, the same tasks
+    :return: mean over tasks, shape ``[runs of the one]``
+    """
+    above, same = better[:, None] > worse[None], better[:, None] == worse[None]
+    shares: Array = (above + 0.5 * same).mean(axis=(1, 2))
+    return shares
 
 
 def profile(scores: Array, taus: Array, reps: int = REPS) -> tuple[Array, Array, Array]:
@@ -193,16 +204,26 @@ def mean(values: Sequence[float]) -> Estimate:
     return Estimate(middle, low, high, len(values))
 
 
-def means_at(
-    seeds: Sequence[Mapping[float, float]],
-) -> tuple[list[float], tuple[Array, Array, Array]]:
-    """Return the mean of curves at the points that all of them have.
+def mean_difference(x: Sequence[float], y: Sequence[float]) -> Estimate:
+    """Return by how much a mean exceeds another, with Welch's t interval at 95 %.
 
-    :param seeds: a curve per seed, as values by point
-    :return: the points in order, and the mean there with the ends of its interval
+    The two sides may have different numbers of seeds and different variances.
+
+    :param x: scores of the one side
+    :param y: scores of the other side
+    :return: ``seeds`` are those of the scarcer side; the ends are nan if it has a single one
     """
-    points = sorted(set.intersection(*(set(curve) for curve in seeds)))
-    return points, mean_interval(np.array([[curve[x] for x in points] for curve in seeds]))
+    least = min(len(x), len(y))
+    effect = float(np.mean(x) - np.mean(y))
+    if least < 2:
+        return Estimate(effect, float("nan"), float("nan"), least)
+    parts = [float(np.var(side, ddof=1)) / len(side) for side in (x, y)]
+    total = sum(parts)
+    if total == 0:
+        return Estimate(effect, effect, effect, least)
+    weights = sum(v**2 / (len(side) - 1) for v, side in zip(parts, (x, y), strict=True))
+    half = t_quantile(total**2 / weights) * math.sqrt(total)
+    return Estimate(effect, effect - half, effect + half, least)
 
 
 def _shares(scores: Array, taus: Array) -> Array:

@@ -21,7 +21,7 @@ def curve(title: str, timesteps: Array, returns: Array) -> Drawing:
     mean, spread = returns.mean(axis=1), returns.std(axis=1)
     spread = np.where(returns.shape[1] > 1, spread, np.nan)  # one episode has no band
     with styled():
-        sheet = Sheet(HEADS, 1)
+        sheet = Sheet(HEADS, 1, band="standard deviation over episodes")
         (axes,) = sheet.axes
         steps = [int(step) for step in timesteps]
         ends = (mean, mean - spread, mean + spread)

@@ -67,7 +67,7 @@ def test_a_table_has_a_row_for_each_method_and_the_best_of_a_column_in_bold(fold
     (found,) = scores(results(folders))
     assert found.table.heads == ["method", "0 %", "90 %", "95 %"]
     assert found.table.rows == [
-        ["Dense: 100 %", Cell(200.0, "200"), None, None],
+        ["Dense", Cell(200.0, "200"), None, None],
         ["Dense, equal parameters", None, Cell(204.0, "200"), None],
         ["SET", None, Cell(300.0, "300", strong=True), None],
         ["RigL", None, Cell(300.0, "300", strong=True), Cell(100.0, "100")],

@@ -2,6 +2,7 @@
 
 from sb3_sparse.report.figures import (  # noqa: F401
     curves,
+    findings,
     flops,
     improvement,
     iqm,

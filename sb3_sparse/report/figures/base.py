@@ -1,20 +1,14 @@
-"""Figures: their registry, and sheets of estimates."""
+"""Figures: their registry."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar
-
-import numpy as np
+from typing import TypeVar
 
 from sb3_sparse.errors import check_choice
-from sb3_sparse.pages import plot
-from sb3_sparse.pages.look import Look
-from sb3_sparse.pages.plot import Axes, Drawing, styled
-from sb3_sparse.report.data import Array
+from sb3_sparse.pages.plot import Drawing, styled
 from sb3_sparse.report.results import Results
-from sb3_sparse.report.statistics import Estimate
 
 Draw = Callable[[Results], Drawing]
 DrawT = TypeVar("DrawT", bound=Draw)
@@ -54,37 +48,6 @@ def check_figures(names: Sequence[str]) -> None:
     """
     for name in names:
         check_choice("figure", name, FIGURES)
-
-
-class Sheet(plot.Sheet):
-    """A sheet that draws estimates, too."""
-
-    def estimates(
-        self,
-        axes: Axes,
-        place: Sequence[Any],
-        estimates: Mapping[Any, Estimate],
-        x: Sequence[float],
-        look: Look,
-        label: str,
-    ) -> None:
-        """Draw estimates as a line, and add their rows.
-
-        :param estimates: the estimates by the value that stands for ``x`` in their rows
-        """
-        self.note(place, estimates)
-        plot.line(axes, x, ends_of(estimates.values()), look, label)
-
-    def note(self, place: Sequence[Any], estimates: Mapping[Any, Estimate]) -> None:
-        """Add the rows of estimates."""
-        for at, e in estimates.items():
-            self.rows.append([*place, at, e.value, e.low, e.high, e.seeds])
-
-
-def ends_of(estimates: Iterable[Estimate]) -> tuple[Array, Array, Array]:
-    """Return the values of estimates, and the lower and upper ends of their intervals."""
-    values, low, high = np.array([(e.value, e.low, e.high) for e in estimates]).T
-    return values, low, high
 
 
 def draw(name: str, results: Results) -> Drawing:

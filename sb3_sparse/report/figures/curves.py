@@ -7,63 +7,49 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sb3_sparse.intervals import mean_interval
+from sb3_sparse.pages.backend import EngFormatter, MaxNLocator
 from sb3_sparse.pages.plot import Drawing
 from sb3_sparse.report.data import Array, RunData
-from sb3_sparse.report.figures.base import Sheet, figure
-from sb3_sparse.report.methods import DENSE, look_of, name_of, percent
-from sb3_sparse.report.results import NotEnoughData, Results
+from sb3_sparse.report.figures.base import figure
+from sb3_sparse.report.figures.compare import Line, compared
+from sb3_sparse.report.figures.grid import Place
+from sb3_sparse.report.normalisation import possible_returns
+from sb3_sparse.report.results import NotEnoughData, Results, cell_of
 
-HEADS = ("family", "environment", "sparsity", "method", "timesteps", "mean", "low", "high", "seeds")
+HEADS = ("algorithm and tasks", "environment", "sparsity", "method", "timesteps", "mean", "low",
+         "high", "seeds")  # fmt: skip
 
 
 @figure(
     "curves",
     "Learning curves",
-    "Mean return of the evaluations during training over seeds, with pointwise 95 % Student t "
-    "intervals (no band for one seed); a panel for each environment and sparsity.",
+    "Return of the evaluations during training: the mean over seeds, from five seeds on with its "
+    "pointwise 95 % Student t interval, which ends at the returns that are possible; below five "
+    "seeds each seed is a thin line. The dense network of full size is grey in every panel.",
 )
 def draw(results: Results) -> Drawing:
-    """Draw a panel for each environment and sparsity, with a line for each method."""
-    places = [
-        (family, env_id, level)
-        for family in results.families()
-        for env_id in results.envs(family)
-        for level in results.levels(family) or [0.0]
-        if any(
-            results.cell(family, env_id, label, level)
-            for label in results.labels(family, level)
-            if label != DENSE or not results.levels(family)
-        )
-    ]
-    if not places:
+    """Draw a row for each environment, and a panel for each sparsity, or method and sparsity."""
+    found: dict[Place, dict[Line, list[RunData]]] = {}
+    for run in sorted(results.main, key=lambda run: (*cell_of(run), run.seed)):
+        lines = found.setdefault(Place(run.family, run.env_id), {})
+        lines.setdefault((run.label, run.level, ""), []).append(run)
+    if not found:
         raise NotEnoughData("there is no trained run")
-    sheet = Sheet(HEADS, len(places))
+    grid, panels = compared(HEADS, found, x="environment steps", y="mean return")
     remarks: list[str] = []
-    for one, (family, env_id, level) in zip(sheet.axes, places, strict=True):
-        for label in results.labels(family, level):
-            runs = results.cell(family, env_id, label, level)
-            if not runs:
-                continue
-            steps, values, said = aligned(runs)
+    for panel in panels:
+        place, one = panel.place, panel.axes
+        for line in panel.lines:
+            label, level, _ = line
+            steps, values, said = aligned(found[place][line])
             remarks += said
-            place = [family, env_id, 0.0 if label == DENSE else level, label]
-            sheet.line(
-                one,
-                place,
-                [int(step) for step in steps],
-                mean_interval(values),
-                [len(values)],
-                look_of(label),
-                name_of(label),
-            )
-        one.set(
-            title=f"{family}\n{env_id}, {percent(level)}",
-            xlabel="environment steps",
-            ylabel="mean return",
-        )
-        one.ticklabel_format(axis="x", style="sci", scilimits=(-3, 4))
-    return sheet.drawing(list(dict.fromkeys(remarks)))
+            x = [int(step) for step in steps]
+            rows = [place.family, place.env_id, level, label]
+            within = possible_returns(place.env_id)
+            grid.curve(one, rows, x, values, label, panel.text(label), within)
+        one.xaxis.set_major_locator(MaxNLocator(3))
+        one.xaxis.set_major_formatter(EngFormatter(sep=""))
+    return grid.drawing(list(dict.fromkeys(remarks)))
 
 
 def aligned(runs: Sequence[RunData]) -> tuple[Array, Array, list[str]]:

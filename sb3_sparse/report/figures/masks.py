@@ -8,17 +8,18 @@ import numpy as np
 
 from sb3_sparse.errors import SparsityError
 from sb3_sparse.loading.zips import look_into
-from sb3_sparse.pages.plot import Drawing, MaxNLocator
+from sb3_sparse.pages.plot import Axes, Drawing, MaxNLocator, Sheet
 from sb3_sparse.policies.compiled import plain_names
 from sb3_sparse.report.data import Array, RunData
-from sb3_sparse.report.figures.base import Sheet, figure
+from sb3_sparse.report.figures.base import figure
 from sb3_sparse.report.methods import name_of, percent
 from sb3_sparse.report.results import NotEnoughData, Results
 from sb3_sparse.zoo.folder import env_name
 
 HEADS = ("run", "method", "sparsity", "layer", "shape", "block row", "densities of the blocks")
 BLOCKS, LAYERS, CLOSE_TO = 128, 4, 0.9
-ORDER = ("rigl", "set", "prune", "granet", "mst", "static")
+SIDE, LONG = 2.2, 18  # inches of a panel, letters of a name
+ORDER = ("prune", "static", "set", "rigl", "granet", "mst")
 
 
 @figure(
@@ -26,12 +27,12 @@ ORDER = ("rigl", "set", "prune", "granet", "mst", "static")
     "Final masks",
     "Active connections of trained networks, output units downwards, inputs to the right, in at "
     "most 128 by 128 blocks: black is all active, white none. One run a method, at the sparsity "
-    "closest to 90 %; the first layers, of which the first reads the observation.",
+    "closest to 90 %; the first layers that are sparse, from the observation on.",
 )
 def draw(results: Results) -> Drawing:
-    """Draw a row for each method, with a panel for each layer."""
+    """Draw a row for each layer, with a panel for each method."""
     remarks: list[str] = []
-    shown: list[tuple[RunData, list[tuple[str, tuple[int, ...], Array]]]] = []
+    shown: list[tuple[RunData, dict[str, tuple[tuple[int, ...], Array]]]] = []
     for run in _chosen(results):
         try:
             masks = masks_of(run)
@@ -41,32 +42,51 @@ def draw(results: Results) -> Drawing:
         if masks:
             shown.append((run, masks))
         else:
-            remarks.append(f"{run.folder}: its model has no mask")
+            remarks.append(f"{run.folder}: its model has no sparse layer")
     if not shown:
         why = f" {'; '.join(remarks)}" if remarks else ""
         raise NotEnoughData(f"no sparse run has a final model with masks.{why}")
-    columns = max(len(masks) for _, masks in shown)
-    sheet = Sheet(HEADS, len(shown) * columns, columns=columns, height=2.3)
-    for row, (run, masks) in enumerate(shown):
-        here = sheet.axes[row * columns : (row + 1) * columns]
-        for one in here[len(masks) :]:
-            one.remove()
-        for one, (name, shape, blocks) in zip(here, masks, strict=False):
-            one.imshow(
-                blocks, cmap="Greys", vmin=0, vmax=1, aspect="auto", interpolation="nearest",
-                extent=(0, int(np.prod(shape[1:])), shape[0], 0),
-            )  # fmt: skip
-            one.grid(visible=False)
-            for axis in (one.xaxis, one.yaxis):
-                axis.set_major_locator(MaxNLocator(5, integer=True))
-            kept = percent(float(f"{density_of(run, name):.3g}"))
-            what = f"{run.env_id}, {name_of(run.label)} at {percent(run.level)}"
-            one.set_title(f"{what}\n{name}: {kept} active")
-            for place, densities in enumerate(blocks):
-                text = " ".join(f"{density:.3g}" for density in densities)
-                dims = "x".join(map(str, shape))
-                sheet.rows.append([run.folder.name, run.label, run.level, name, dims, place, text])
-    return Drawing(sheet.figure, sheet.heads, sheet.rows, remarks)
+    names = list(dict.fromkeys(name for _, masks in shown for name in masks))[:LAYERS]
+    first = shown[0][0]
+    algorithm = first.family.rsplit(" on ", 1)[0]
+    sheet = Sheet(
+        HEADS, len(shown) * len(names), len(shown), SIDE, width=SIDE,
+        title=f"{algorithm} on {first.env_id}, {percent(first.level)} sparse",
+        x="input", y="output",
+    )  # fmt: skip
+    for column, (run, masks) in enumerate(shown):
+        for row, name in enumerate(names):
+            one = sheet.axes[row * len(shown) + column]
+            if name in masks:
+                _panel(one, *masks[name])
+                _note(sheet, run, name, *masks[name])
+            else:
+                one.set_visible(False)
+            head = f"{name_of(run.label)}\n" if row == 0 else ""
+            one.set_title(f"{head}{percent(float(f'{density_of(run, name):.2g}'))} active")
+            one.tick_params(labelleft=column == 0)
+            if column == 0:
+                one.set_ylabel(name.replace(".", ".\n", 1) if len(name) > LONG else name)
+    return sheet.drawing(remarks)
+
+
+def _panel(one: Axes, shape: tuple[int, ...], blocks: Array) -> None:
+    one.imshow(
+        blocks, cmap="Greys", vmin=0, vmax=1, aspect="auto", interpolation="nearest",
+        extent=(0, int(np.prod(shape[1:])), shape[0], 0),
+    )  # fmt: skip
+    one.grid(visible=False)
+    for side in ("top", "right"):
+        one.spines[side].set_visible(True)
+    for axis in (one.xaxis, one.yaxis):
+        axis.set_major_locator(MaxNLocator(3, integer=True))
+
+
+def _note(sheet: Sheet, run: RunData, name: str, shape: tuple[int, ...], blocks: Array) -> None:
+    dims = "x".join(map(str, shape))
+    for place, densities in enumerate(blocks):
+        text = " ".join(f"{density:.3g}" for density in densities)
+        sheet.rows.append([run.folder.name, run.label, run.level, name, dims, place, text])
 
 
 def _chosen(results: Results) -> list[RunData]:
@@ -81,20 +101,20 @@ def _chosen(results: Results) -> list[RunData]:
     return [run for label in ORDER for run in [r for r in at if r.label == label][:1]]
 
 
-def masks_of(run: RunData) -> list[tuple[str, tuple[int, ...], Array]]:
-    """Read names, shapes and block densities of the first layers' masks from the final model.
+def masks_of(run: RunData) -> dict[str, tuple[tuple[int, ...], Array]]:
+    """Read shapes and block densities of the first sparse layers' masks from the final model.
 
     :raises ConfigError: if there is no model
     :raises CorruptStateError: if it is damaged
     """
     path = Path(run.folder) / f"{env_name(run.env_id)}.zip"
-    state, found = plain_names(look_into(path).state), []
+    state, found = plain_names(look_into(path).state), {}
     for layer in run.layers:
         mask = state.get(f"{layer['name']}.weight_mask")
-        if mask is not None and mask.dim() > 1:
+        if mask is not None and mask.dim() > 1 and density_of(run, layer["name"]) < 1:
             flat = mask.reshape(mask.shape[0], -1).numpy().astype(np.float64)
-            found.append((str(layer["name"]), tuple(mask.shape), blocks_of(flat)))
-    return found[:LAYERS]
+            found[str(layer["name"])] = (tuple(mask.shape), blocks_of(flat))
+    return found
 
 
 def density_of(run: RunData, name: str) -> float:

@@ -2,46 +2,42 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
-
 from sb3_sparse.pages.plot import Drawing
-from sb3_sparse.report.figures.base import Sheet, figure
+from sb3_sparse.report.figures.base import figure
+from sb3_sparse.report.figures.compare import Line, compared, stacked
+from sb3_sparse.report.figures.grid import Place
 from sb3_sparse.report.measured import NOISE, returns_by_sigma
-from sb3_sparse.report.methods import DENSE, name_of, percent, shaded
-from sb3_sparse.report.results import NotEnoughData, Results
-from sb3_sparse.report.statistics import means_at
+from sb3_sparse.report.normalisation import possible_returns
+from sb3_sparse.report.results import NotEnoughData, Results, cell_of
 
-HEADS = ("family", "environment", "method", "parameters kept", "sigma", "return", "low", "high",
-         "seeds")  # fmt: skip
+HEADS = ("algorithm and tasks", "environment", "method", "parameters kept", "sigma", "return",
+         "low", "high", "seeds")  # fmt: skip
 
 
 @figure(
     "noise",
     "Robustness to observation noise",
-    "Mean return of trained policies against the strength of noise added to observations, with "
-    "95 % Student t intervals over seeds; colours tell how many parameters are kept, markers "
-    "and line styles the method.",
+    "Mean return of trained policies against the strength of the noise that is added to "
+    "observations: from five seeds on with 95 % Student t intervals, below that with a thin line "
+    "for each seed. The dense network of full size is grey in every panel.",
 )
 def draw(results: Results) -> Drawing:
-    """Draw a panel for each environment, with a line for each method and regime."""
-    found: dict[tuple[str, str], dict[tuple[float, str], list[dict[float, float]]]] = {}
-    for run in results.main:
+    """Draw a row for each environment, and a panel for each sparsity, or method and sparsity."""
+    found: dict[Place, dict[Line, list[dict[float, float]]]] = {}
+    for run in sorted(results.main, key=lambda run: (*cell_of(run), run.seed)):
         by_sigma = returns_by_sigma(run.measured)
         if by_sigma:
-            lines = found.setdefault((run.family, run.env_id), defaultdict(list))
-            lines[run.level, run.label].append(by_sigma)
+            lines = found.setdefault(Place(run.family, run.env_id), {})
+            lines.setdefault((run.label, run.level, ""), []).append(by_sigma)
     if not found:
         raise NotEnoughData(f"no run has a {NOISE}")
-    sheet = Sheet(HEADS, len(found), height=3.2)
-    regimes = sorted({level for lines in found.values() for level, _ in lines})
-    for one, ((family, env_id), lines) in zip(sheet.axes, sorted(found.items()), strict=True):
-        for (level, label), seeds in sorted(lines.items()):
-            sigmas, ends = means_at(seeds)
-            if not sigmas:
-                continue
-            look = shaded(label, regimes.index(level))
-            kept = "" if label == DENSE else f", {percent(1 - level)} kept"
-            place = [family, env_id, label, 1 - level]
-            sheet.line(one, place, sigmas, ends, [len(seeds)], look, f"{name_of(label)}{kept}")
-        one.set(title=f"{family}\n{env_id}", xlabel="σ of the noise", ylabel="mean return")
-    return sheet.drawing()
+    grid, panels = compared(HEADS, found, x="standard deviation of the noise", y="mean return")
+    for panel in panels:
+        for line in panel.lines:
+            label, level, _ = line
+            sigmas, values = stacked(found[panel.place][line])
+            if sigmas:
+                rows = [panel.place.family, panel.place.env_id, label, 1 - level]
+                within = possible_returns(panel.place.env_id)
+                grid.curve(panel.axes, rows, sigmas, values, label, panel.text(label), within)
+    return grid.drawing()

@@ -6,94 +6,141 @@ from statistics import fmean
 
 import numpy as np
 
-from sb3_sparse.pages.plot import Axes, Drawing, line, logarithmic
-from sb3_sparse.report.figures.base import Sheet, ends_of, figure
+from sb3_sparse.intervals import mean_interval
+from sb3_sparse.pages.backend import Axes, NullLocator
+from sb3_sparse.pages.lines import (
+    BAND,
+    BOLD,
+    FAINT,
+    LEAST_FOR_BAND,
+    SEED,
+    THIN,
+    Within,
+    logarithmic,
+    points,
+)
+from sb3_sparse.pages.plot import Drawing
+from sb3_sparse.report.figures.base import figure
+from sb3_sparse.report.figures.compare import MOST_LINES, no_runs
+from sb3_sparse.report.figures.grid import Grid, Place, Row
 from sb3_sparse.report.methods import DENSE, EQUAL, in_order, look_of, name_of, percent
+from sb3_sparse.report.normalisation import possible_returns
 from sb3_sparse.report.results import NotEnoughData, Results
-from sb3_sparse.report.statistics import Estimate, mean
 
-HEADS = ("family", "environment", "method", "sparsity", "parameters", "mean score", "low", "high",
-         "seeds")  # fmt: skip
-MARKED = (0.8, 0.9)
+HEADS = ("algorithm and tasks", "environment", "method", "sparsity", "parameters", "mean score",
+         "low", "high", "seeds")  # fmt: skip
+ABOVE = 16.0  # points that the axis of sparsities takes
+APART = 0.085  # least share of a panel between two of its labels
+SPARE = 1.3
 
 
 @figure(
     "parameters",
     "Final reward against parameter count",
     "Mean score (the last 10 % of evaluations) against active parameters on a logarithmic axis, "
-    "with 95 % Student t intervals (none for one seed); sparsities are written along one curve. "
-    "The horizontal line is the dense network of full size, the vertical one marks 80 % sparsity "
-    "(90 % where no run has 80 %).",
+    "with the sparsity above: from five seeds on with 95 % Student t intervals, which end at the "
+    "returns that are possible, below that with a small dot for each seed. The horizontal line is "
+    "the dense network of full size.",
 )
 def draw(results: Results) -> Drawing:
-    """Draw a panel for each environment, with a line for each method."""
+    """Draw a row for each environment, and a panel for each method if there are many."""
     places = [
-        (family, env_id)
+        Place(family, env_id)
         for family in results.families()
         for env_id in results.envs(family)
-        if any(
-            results.cell(family, env_id, label, level)
-            for level in results.levels(family)
-            for label in results.labels(family, level)
-            if label != DENSE
-        )
-    ]
+        if any(_points(results, Place(family, env_id), label) for label in results.labels(family)
+               if label != DENSE)
+    ]  # fmt: skip
     if not places:
         raise NotEnoughData("there is no trained run except dense ones of full size")
-    sheet = Sheet(HEADS, len(places), height=3.2)
-    for one, (family, env_id) in zip(sheet.axes, places, strict=True):
-        _panel(one, sheet, results, family, env_id)
-    return sheet.drawing()
-
-
-def _panel(one: Axes, sheet: Sheet, results: Results, family: str, env_id: str) -> None:
-    annotated = False
-    sizes: list[float] = []
-    labels = in_order(set(results.labels(family)))
-    # Pruning carries the annotations, as in the paper, or else the first sparse method.
-    for label in sorted(labels, key=lambda label: (label in (DENSE, EQUAL), label != "prune")):
-        points = []
-        for level in [0.0] if label == DENSE else results.levels(family):
-            runs = results.cell(family, env_id, label, level)
-            if runs:
-                parameters = fmean(run.parameters for run in runs)
-                points.append((parameters, level, mean([run.score for run in runs])))
-        for parameters, level, estimate in points:
-            sheet.note([family, env_id, label, level], {round(parameters): estimate})
-        if not points:
-            continue
-        if label == DENSE:
-            _horizontal(one, points[0][2])
-            continue
-        points.sort(key=lambda point: point[0])
-        sizes += [parameters for parameters, _, _ in points]
-        look = look_of(label)
-        line(one, [p[0] for p in points], ends_of([p[2] for p in points]), look, name_of(label))
-        if label != EQUAL and not annotated:
-            annotated = True
-            _annotate(one, points, look.color)
-    one.margins(x=0.1, y=0.12)
-    if max(sizes) < 1.5 * min(sizes):
-        one.set_xlim(min(sizes) / 2, max(sizes) * 2)
-    logarithmic(one, "x")
-    one.set(title=f"{family}\n{env_id}", xlabel="parameters", ylabel="mean score")
-
-
-def _annotate(one: Axes, points: list[tuple[float, float, Estimate]], color: str) -> None:
-    """Write the sparsities along a line, and mark one of them."""
-    for parameters, level, estimate in points:
-        one.annotate(
-            percent(level), (parameters, estimate.value), textcoords="offset points",
-            xytext=(0, 6), ha="center", fontsize=7, color=color,
+    labels = in_order({label for place in places for label in results.labels(place.family)})
+    sparse = [label for label in labels if label not in (DENSE, EQUAL)]
+    few = len(labels) <= MOST_LINES
+    columns = [""] if few else [name_of(label) for label in sparse]
+    x, y = "active parameters", "mean score"
+    grid = Grid(HEADS, [Row(place) for place in places], columns, x=x, y=y, above=ABOVE)
+    for i, place in enumerate(places):
+        sizes: list[dict[float, float]] = []
+        for j in range(len(columns)):
+            shown = labels if few else [label for label in (DENSE, EQUAL) if label in labels]
+            named = "" if few else sparse[j]
+            drawn = [*shown, *([named] if named else [])]
+            sizes.append(_panel(grid, grid.at(i, j), results, place, drawn, named))
+        every = [size for found in sizes for size in found.values()]
+        for j, found in enumerate(sizes):
+            grid.at(i, j).set_xlim(min(every) / SPARE, max(every) * SPARE)
+            logarithmic(grid.at(i, j), "x")
+            _sparsities(grid.at(i, j), found)
+        grid.at(i, 0).annotate(
+            "sparsity, %", (0, 1), (-6, 6), xycoords="axes fraction", textcoords="offset points",
+            ha="right", annotation_clip=False,
         )  # fmt: skip
-    known = {level: parameters for parameters, level, _ in points}
-    marked = next((level for level in MARKED if level in known), None)
-    if marked is not None:
-        one.axvline(known[marked], color="#999999", linewidth=0.9, linestyle=":")
+    return grid.drawing()
 
 
-def _horizontal(one: Axes, dense: Estimate) -> None:
+def _points(results: Results, place: Place, label: str) -> list[tuple[float, float, list[float]]]:
+    """Return parameters, sparsity and scores of a method, in order of parameters."""
+    found = []
+    for level in [0.0] if label == DENSE else results.levels(place.family):
+        runs = results.cell(place.family, place.env_id, label, level)
+        if runs:
+            parameters = fmean(run.parameters for run in runs)
+            found.append((parameters, level, [run.score for run in runs]))
+    return sorted(found)
+
+
+def _panel(
+    grid: Grid, one: Axes, results: Results, place: Place, labels: list[str], named: str
+) -> dict[float, float]:
+    """Draw a panel, and return the parameters by sparsity."""
+    sizes: dict[float, float] = {}
+    for label in labels:
+        given = _points(results, place, label)
+        if label == named and not given:
+            no_runs(one)
+        text = "" if label == named else name_of(label)
+        if label == DENSE:
+            _horizontal(one, text, given, possible_returns(place.env_id))
+        elif given:
+            x, scores = [at for at, *_ in given], [values for *_, values in given]
+            sizes.update({level: at for at, level, _ in given})
+            points(one, x, scores, look_of(label), text, possible_returns(place.env_id))
+        for parameters, level, values in given:
+            row = [place.family, place.env_id, label, level]
+            grid.note_once(row, [round(parameters)], [values])
+    return sizes
+
+
+def _sparsities(one: Axes, sizes: dict[float, float]) -> None:
+    """Put an axis of sparsities above a panel, with as many labels as have room."""
+    above = one.secondary_xaxis("top")
+    kept: list[float] = []
+    for level, size in sorted(sizes.items(), key=lambda item: item[1]):
+        at = one.transAxes.inverted().transform(one.transData.transform((size, 0)))[0]
+        before = [
+            one.transAxes.inverted().transform(one.transData.transform((sizes[other], 0)))[0]
+            for other in kept
+        ]
+        if not before or at - max(before) >= APART:
+            kept.append(level)
+    above.xaxis.set_minor_locator(NullLocator())
+    above.set_xticks([sizes[level] for level in kept], [percent(level)[:-2] for level in kept])
+    above.spines["top"].set_visible(True)
+
+
+def _horizontal(
+    one: Axes, text: str, given: list[tuple[float, float, list[float]]], within: Within
+) -> None:
+    """Draw the dense network as a line across the panel."""
     look = look_of(DENSE)
-    one.axhline(dense.value, color=look.color, linestyle=look.line, label=name_of(DENSE))
-    if not np.isnan(dense.low):
-        one.axhspan(dense.low, dense.high, color=look.color, alpha=0.08, linewidth=0)
+    for _, _, scores in given:
+        middle, low, high = map(float, mean_interval(scores))
+        one.axhline(
+            middle, color=look.color, linestyle=look.line, linewidth=BOLD, label=text or None
+        )
+        if len(scores) >= LEAST_FOR_BAND:
+            low, high = np.clip((low, high), *within)
+            one.axhspan(low, high, color=look.color, alpha=0.12, linewidth=0, gid=BAND)
+        elif len(scores) > 1:
+            for score in scores:
+                one.axhline(score, color=look.color, linewidth=THIN, alpha=FAINT, gid=SEED)

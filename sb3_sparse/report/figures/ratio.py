@@ -3,34 +3,37 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from statistics import fmean
 
-from sb3_sparse.pages.plot import Drawing
+from sb3_sparse.pages.plot import GREY, Drawing
 from sb3_sparse.report.data import RunData
-from sb3_sparse.report.figures.base import Sheet, figure
-from sb3_sparse.report.methods import DENSE, name_of, percent, shaded
+from sb3_sparse.report.figures.base import figure
+from sb3_sparse.report.figures.compare import Line, Panel, compared
+from sb3_sparse.report.figures.grid import Place
+from sb3_sparse.report.methods import DENSE
+from sb3_sparse.report.normalisation import possible_returns
 from sb3_sparse.report.results import NotEnoughData, Results
-from sb3_sparse.report.statistics import mean
 
-HEADS = ("family", "environment", "method", "budget", "actor's share", "mean score", "low", "high",
-         "seeds")  # fmt: skip
-Line = tuple[str, float, str]
+HEADS = ("algorithm and tasks", "environment", "method", "budget", "actor's share", "mean score",
+         "low", "high", "seeds")  # fmt: skip
+Shares = dict[float, list[RunData]]
 
 
 @figure(
     "ratio",
     "Actor or critic",
-    "Mean score against the actor's share of all connections (both critics counted) for each "
-    "budget of parameters, with 95 % Student t intervals. The vertical line is the standard "
-    "split, the horizontal one the dense network of full size.",
+    "Mean score against the actor's share of all connections (both critics counted), a panel for "
+    "each budget of parameters: from five seeds on with 95 % Student t intervals, below that with "
+    "a small dot for each seed.",
 )
 def draw(results: Results) -> Drawing:
-    """Draw a panel for each environment, with a line for each budget and method."""
-    found: dict[tuple[str, str], dict[Line, dict[float, list[RunData]]]] = {}
-    for run in results.trained:
+    """Draw a row for each environment, and a panel for each budget."""
+    found: dict[Place, dict[Line, Shares]] = {}
+    for run in sorted(results.trained, key=lambda run: (run.family, run.env_id, run.seed)):
         if run.actor_share is not None:
             kind = (run.label, _budget(results, run), run.variant("actor_share", "net_arch"))
-            shares = found.setdefault((run.family, run.env_id), {}).setdefault(kind, {})
-            shares.setdefault(round(run.actor_share, 2), []).append(run)
+            lines = found.setdefault(Place(run.family, run.env_id), {})
+            lines.setdefault(kind, {}).setdefault(round(run.actor_share, 2), []).append(run)
     places = {
         place: kept
         for place, lines in found.items()
@@ -41,26 +44,37 @@ def draw(results: Results) -> Drawing:
             "no method was trained with two or more shares of the actor (actor_share) and "
             "otherwise equal settings"
         )
-    sheet = Sheet(HEADS, len(places), height=3.0)
-    for one, ((family, env_id), lines) in zip(sheet.axes, sorted(places.items()), strict=True):
-        budgets = sorted({budget for _, budget, _ in lines}, reverse=True)
-        for (label, budget, _), shares in sorted(lines.items()):
-            estimates = {x: mean([run.score for run in runs]) for x, runs in sorted(shares.items())}
-            look = shaded(label, budgets.index(budget))
-            name = "Dense" if label == DENSE else name_of(label)
-            text = f"{name}, {percent(budget)} of parameters"
-            place = [family, env_id, label, budget]
-            sheet.estimates(one, place, estimates, [100 * x for x in estimates], look, text)
-        usual = _usual(results, family, env_id)
-        if usual is not None:
-            one.axvline(100 * usual, color="#999999", linewidth=0.9, linestyle=":")
-        dense = results.cell(family, env_id, DENSE, 0.0)
-        if dense:
-            level_line = mean([run.score for run in dense]).value
-            one.axhline(level_line, color="#444444", linestyle="--", label=name_of(DENSE))
-        title = f"{family}\n{env_id}"
-        one.set(title=title, xlabel="actor's share of connections, %", ylabel="mean score")
-    return sheet.drawing()
+    grid, panels = compared(
+        HEADS, places, x="actor's share of connections, %", y="mean score",
+        level_text="{} of the parameters", dense_everywhere=False,
+    )  # fmt: skip
+    for panel in panels:
+        place = panel.place
+        for line in panel.lines:
+            label, budget, _ = line
+            shares = sorted(places[place][line].items())
+            scores = [[run.score for run in runs] for _, runs in shares]
+            names = [share for share, _ in shares]
+            rows, x = [place.family, place.env_id, label, budget], [100 * x for x in names]
+            within, text = possible_returns(place.env_id), panel.text(label)
+            grid.points(panel.axes, rows, x, scores, label, text, within, names)
+        if panel.lines:
+            _standards(results, panel)
+    return grid.drawing()
+
+
+def _standards(results: Results, panel: Panel) -> None:
+    """Draw the standard split, and the dense network of full size."""
+    place = panel.place
+    usual = _usual(results, place.family, place.env_id)
+    if usual is not None:
+        panel.axes.axvline(
+            100 * usual, color=GREY, linewidth=0.9, linestyle=":", label="standard split"
+        )
+    dense = results.cell(place.family, place.env_id, DENSE, 0.0)
+    if dense:
+        score = fmean(run.score for run in dense)
+        panel.axes.axhline(score, color=GREY, linewidth=0.9, label="dense network of full size")
 
 
 def _budget(results: Results, run: RunData) -> float:

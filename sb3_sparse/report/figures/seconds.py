@@ -5,17 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable
 from statistics import fmean
 
-from sb3_sparse.pages.plot import Drawing, line, logarithmic
+from sb3_sparse.pages.lines import logarithmic, points
+from sb3_sparse.pages.plot import Drawing
 from sb3_sparse.report.data import RunData
-from sb3_sparse.report.figures.base import Sheet, ends_of, figure
-from sb3_sparse.report.methods import DENSE, in_order, name_of, percent, shaded
+from sb3_sparse.report.figures.base import figure
+from sb3_sparse.report.figures.compare import Line, compared
+from sb3_sparse.report.figures.grid import Place
+from sb3_sparse.report.methods import look_of
+from sb3_sparse.report.normalisation import possible_returns
 from sb3_sparse.report.results import NotEnoughData, Results
-from sb3_sparse.report.statistics import mean
 
-HEADS = ("family", "environment", "method", "sparsity", "net_arch")
+HEADS = ("algorithm and tasks", "environment", "method", "sparsity", "net_arch")
 ENDS = ("mean score", "low", "high", "seeds")
-Place = tuple[str, str]
-Line = tuple[str, float, str]
 Cost = Callable[[RunData], float | None]
 Lines = dict[Line, dict[str, list[RunData]]]
 """The runs of each width, by method, sparsity and all other settings."""
@@ -24,69 +25,74 @@ Lines = dict[Line, dict[str, list[RunData]]]
 @figure(
     "scaling",
     "Final reward against parameter count, over widths",
-    "Mean score against active parameters on a logarithmic axis, with 95 % Student t intervals; a "
-    "line for each method and sparsity, a point for each width of the network (net_arch). A point "
-    "to the upper left of another has more reward for fewer parameters.",
+    "Mean score against active parameters on a logarithmic axis, a point for each width of the "
+    "network (net_arch): from five seeds on with 95 % Student t intervals, below that with a small "
+    "dot for each seed. A point to the upper left of another has more reward for fewer parameters. "
+    "The dense network is grey in every panel.",
 )
 def draw_parameters(results: Results) -> Drawing:
-    """Draw a panel for each environment, with a line for each method and sparsity."""
-    found = _found(results, lambda run: run.parameters)
-    if not any(len(points) > 1 for lines in found.values() for points in lines.values()):
+    """Draw a row for each environment, and a panel for each sparsity, or method and sparsity."""
+    found = {
+        place: kept
+        for place, lines in _found(results, lambda run: run.parameters).items()
+        if (kept := {line: widths for line, widths in lines.items() if len(widths) > 1})
+    }
+    if not found:
         raise NotEnoughData(
             "no method was trained with two or more widths (net_arch) and otherwise equal settings"
         )
-    return _drawing(found, lambda run: run.parameters, "parameters")
+    return _drawing(found, lambda run: run.parameters, "parameters", "active parameters")
 
 
 @figure(
     "seconds",
     "Final reward against seconds of training",
     "Mean score against the mean seconds that a run trained, evaluations left out, on a "
-    "logarithmic axis, with 95 % Student t intervals; a line for each method and sparsity, a point "
-    "for each width of the network (net_arch). Seconds are those of the processor, over all "
-    "threads, or on a GPU those that passed; they depend on the machine. A point to the upper left "
-    "of another has more reward in less time.",
+    "logarithmic axis, a point for each width of the network (net_arch): from five seeds on with "
+    "95 % Student t intervals, below that with a small dot for each seed. Seconds are those of the "
+    "processor, over all threads, or on a GPU those that passed; they depend on the machine. A "
+    "point to the upper left of another has more reward in less time. The dense network is grey in "
+    "every panel.",
 )
 def draw_seconds(results: Results) -> Drawing:
-    """Draw a panel for each environment, with a line for each method and sparsity."""
+    """Draw a row for each environment, and a panel for each sparsity, or method and sparsity."""
     found = _found(results, lambda run: run.seconds)
     if not found:
         raise NotEnoughData("no record of a trained run has its seconds of training")
-    return _drawing(found, lambda run: run.seconds, "seconds of training")
+    what = "seconds of training"
+    return _drawing(found, lambda run: run.seconds, what, what)
 
 
 def _found(results: Results, cost: Cost) -> dict[Place, Lines]:
     """Group the trained runs whose cost is known."""
     found: dict[Place, Lines] = {}
-    for run in results.trained:
+    for run in sorted(results.trained, key=lambda run: (run.family, run.env_id, run.seed)):
         if cost(run) is not None:
-            lines = found.setdefault((run.family, run.env_id), {})
-            points = lines.setdefault((run.label, run.level, run.variant("net_arch")), {})
-            points.setdefault(str(run.asked.value("net_arch")), []).append(run)
+            lines = found.setdefault(Place(run.family, run.env_id), {})
+            widths = lines.setdefault((run.label, run.level, run.variant("net_arch")), {})
+            widths.setdefault(str(run.asked.value("net_arch")), []).append(run)
     return found
 
 
-def _drawing(found: dict[Place, Lines], cost: Cost, what: str) -> Drawing:
-    sheet = Sheet((*HEADS, what, *ENDS), len(found), height=3.2)
-    for one, ((family, env_id), lines) in zip(sheet.axes, sorted(found.items()), strict=True):
-        order = in_order({label for label, *_ in lines})
-        levels = sorted({level for label, level, _ in lines if label != DENSE})
-        for (label, level, _), points in sorted(
-            lines.items(), key=lambda item: (order.index(item[0][0]), *item[0][1:])
-        ):
+def _drawing(found: dict[Place, Lines], cost: Cost, head: str, x_label: str) -> Drawing:
+    grid, panels = compared((*HEADS, head, *ENDS), found, x=x_label, y="mean score")
+    for panel in panels:
+        place = panel.place
+        for line in panel.lines:
+            label, level, _ = line
             drawn = []
-            for widths, runs in points.items():
+            for widths, runs in found[place][line].items():
                 x = fmean(cost(run) or 0.0 for run in runs)
-                drawn.append((x, widths, mean([run.score for run in runs])))
+                scores = [run.score for run in runs]
+                drawn.append((x, scores))
+                row = [place.family, place.env_id, label, level, widths]
+                grid.note_once(row, [round(x, 1)], [scores])
             drawn.sort(key=lambda point: point[0])
-            for x, widths, estimate in drawn:
-                sheet.note([family, env_id, label, level, widths], {round(x, 1): estimate})
-            dense = label == DENSE
-            look = shaded(label, 0 if dense else 1 + levels.index(level))
-            text = name_of(label) if dense else f"{name_of(label)}, {percent(level)}"
-            ends = ends_of([estimate for *_, estimate in drawn])
-            line(one, [x for x, *_ in drawn], ends, look, text)
-        one.margins(x=0.1, y=0.12)
-        logarithmic(one, "x")
-        one.set(title=f"{family}\n{env_id}", xlabel=what, ylabel="mean score")
-    return sheet.drawing()
+            within, text = possible_returns(place.env_id), panel.text(label)
+            given = [scores for _, scores in drawn]
+            points(panel.axes, [x for x, _ in drawn], given, look_of(label), text, within)
+        panel.axes.margins(x=0.12)
+        panel.axes.set_xscale("log")
+    for panel in panels:
+        logarithmic(panel.axes, "x")
+    return grid.drawing()

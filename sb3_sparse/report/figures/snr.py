@@ -2,48 +2,51 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
+from sb3_sparse.pages.backend import EngFormatter, MaxNLocator
+from sb3_sparse.pages.lines import logarithmic
+from sb3_sparse.pages.plot import Drawing
+from sb3_sparse.report.figures.base import figure
+from sb3_sparse.report.figures.compare import Line, compared, stacked
+from sb3_sparse.report.figures.grid import Place
+from sb3_sparse.report.measured import SNR, snr_by_network
+from sb3_sparse.report.results import NotEnoughData, Results, cell_of
 
-from sb3_sparse.pages.plot import Drawing, logarithmic
-from sb3_sparse.report.figures.base import Sheet, figure
-from sb3_sparse.report.measured import SNR, Points, snr_by_network
-from sb3_sparse.report.methods import DENSE, name_of, percent, shaded
-from sb3_sparse.report.results import NotEnoughData, Results
-from sb3_sparse.report.statistics import means_at
-
-HEADS = ("family", "environment", "network", "method", "sparsity", "timesteps", "snr", "low",
-         "high", "seeds")  # fmt: skip
+HEADS = ("algorithm and tasks", "environment", "network", "method", "sparsity", "timesteps", "snr",
+         "low", "high", "seeds")  # fmt: skip
+LEAST = 1e-9  # logarithmic axes have no 0
 
 
 @figure(
     "snr",
     "Signal-to-noise ratio",
     "Mean over all parameters, active or not, of |mean|/std of the gradients of single samples in "
-    "a minibatch, over training, with 95 % Student t intervals over seeds; a panel for each "
-    "network, a colour for each sparsity, a marker and line style for each method.",
+    "a minibatch, over training: the mean over seeds, from five seeds on with its 95 % Student t "
+    "interval, below that with a thin line for each seed. The dense network is grey in every "
+    "panel.",
 )
 def draw(results: Results) -> Drawing:
-    """Draw a panel for each network, with a line for each method and sparsity."""
-    found: dict[tuple[str, str, str], dict[tuple[str, float], list[Points]]] = {}
-    for run in results.main:
+    """Draw a row for each network, and a panel for each sparsity."""
+    found: dict[Place, dict[Line, list[dict[float, float]]]] = {}
+    for run in sorted(results.main, key=lambda run: (*cell_of(run), run.seed)):
         for network, points in snr_by_network(run.measured).items():
-            lines = found.setdefault((run.family, run.env_id, network), defaultdict(list))
-            lines[run.label, run.level].append(points)
+            lines = found.setdefault(Place(run.family, run.env_id, network), {})
+            lines.setdefault((run.label, run.level, ""), []).append(dict(points))
     if not found:
         raise NotEnoughData(f"no run has a {SNR}")
-    sheet = Sheet(HEADS, len(found), height=3.0)
-    levels = sorted({level for lines in found.values() for _, level in lines})
-    panels = zip(sheet.axes, sorted(found.items()), strict=True)
-    for one, ((family, env_id, network), lines) in panels:
-        for (label, level), seeds in sorted(lines.items(), key=lambda item: item[0][::-1]):
-            steps, ends = means_at([dict(points) for points in seeds])
-            if not steps:
-                continue
-            look = shaded(label, levels.index(level))
-            text = name_of(label) if label == DENSE else f"{name_of(label)}, {percent(level)}"
-            place = [family, env_id, network, label, level]
-            sheet.line(one, place, list(map(int, steps)), ends, [len(seeds)], look, text)
-        logarithmic(one, "y")
-        title = f"{family}\n{env_id}, {network}"
-        one.set(title=title, xlabel="environment steps", ylabel="SNR")
-    return sheet.drawing()
+    ordered = dict(sorted(found.items()))
+    y = "signal-to-noise ratio"
+    grid, panels = compared(HEADS, ordered, x="environment steps", y=y)
+    for panel in panels:
+        place = panel.place
+        for line in panel.lines:
+            label, level, _ = line
+            steps, values = stacked(found[place][line])
+            if steps:
+                rows = [place.family, place.env_id, place.part, label, level]
+                x = [int(step) for step in steps]
+                text, within = panel.text(label), (LEAST, float("inf"))
+                grid.curve(panel.axes, rows, x, values, label, text, within)
+        logarithmic(panel.axes, "y")
+        panel.axes.xaxis.set_major_locator(MaxNLocator(3))
+        panel.axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    return grid.drawing()
