@@ -95,6 +95,8 @@ def export_command(
     try:
         if envs is not None:
             observations = record_observations(loaded, envs, RECORDED)
+            if int8 == "full":
+                say("Both policies play 20 episodes or more; with images, this takes minutes ...")
         report = export_policy(
             loaded,
             out,
