@@ -1,0 +1,67 @@
+"""The documents show what docs/draw.py gives of the archive of runs."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import re
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def draw():
+    spec = importlib.util.spec_from_file_location("docs_draw", ROOT / "docs/draw.py")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # where dataclasses look up its annotations
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def texts(draw):
+    return {path.name: path.read_text() for path in draw.DOCUMENTS}
+
+
+@pytest.fixture(scope="module")
+def drawn(draw, texts):
+    (count,) = draw.LINES.findall(texts["findings.md"])
+    return draw.Drawn(draw.ARCHIVE, int(count.replace(",", "")))
+
+
+def blocks(draw, texts):
+    return {
+        found[2]: found[0].split("\n", 1)[1].rsplit("<!-- end -->", 1)[0]
+        for text in texts.values()
+        for found in draw.BLOCK.finditer(text)
+    }
+
+
+@pytest.mark.parametrize("name", ["finding snr", "scores ppo small parameters"])
+def test_a_block_is_what_its_lines_of_the_archive_give(draw, drawn, texts, name):
+    assert blocks(draw, texts)[name] == drawn.block(name)
+
+
+def test_every_finding_of_the_paper_has_its_block(draw, texts):
+    found = [name.split()[1] for name in blocks(draw, texts) if name.startswith("finding ")]
+    assert found == [finding.key for finding in draw.FINDINGS] == list(draw.STUDIES)
+
+
+def test_every_picture_is_there_and_none_is_left_over(draw, texts):
+    shown = set(re.findall(r"figures/([\w.-]+\.svg)", "".join(texts.values())))
+    assert shown == {path.name for path in (ROOT / "docs/figures").iterdir()}
+
+
+def test_only_the_first_lines_of_an_archive_count(draw, tmp_path):
+    lines = draw.ARCHIVE.read_text().splitlines(keepends=True)
+    wanted = [line for line in lines if json.loads(line)["record"]["run"]["algo"] == "ppo"]
+    archive = tmp_path / "runs.jsonl"
+    archive.write_text("".join(wanted[:3]))
+    two = draw.Drawn(archive, 2)
+    assert two.block("archive") == "Drawn from the first 2 lines of the archive.\n"
+    assert len(two.shown("ppo", "small").results.runs) == 2
+    assert len(draw.Drawn(archive).shown("ppo", "small").results.runs) == 3
