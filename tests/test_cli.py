@@ -33,7 +33,8 @@ def sb3_sparse(
 
 def test_train_says_what_it_does_and_enjoy_and_inspect_read_it(tmp_path):
     evaluation = ["--eval-freq", "500", "--eval-episodes", "2"]
-    done = sb3_sparse("train", "-n", "1500", "--seed", "3", *evaluation, *QUICK, cwd=tmp_path)
+    run = ["--env", "CartPole-v1", "-n", "1500", "--seed", "3"]
+    done = sb3_sparse("train", *run, *evaluation, *QUICK, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "Training DQN on CartPole-v1, rigl at 90% (ERK), seed 3" in done.stdout
     assert "\nGradient steps: fused\n" in done.stdout
@@ -94,7 +95,7 @@ def test_inspect_of_a_damaged_file_and_of_a_model_without_minibatches(tmp_path):
 
 def test_a_killed_run_goes_on_from_its_last_evaluation(tmp_path):
     folder = tmp_path / "logs" / "dqn" / "CartPole-v1_1"
-    args = ["-n", "3000", "--eval-freq", "300", "--eval-episodes", "1", *QUICK]
+    args = ["--algo", "dqn", "-n", "3000", "--eval-freq", "300", "--eval-episodes", "1", *QUICK]
     code = "from sb3_sparse.cli import main; main()"
     running = subprocess.Popen([sys.executable, "-c", code, "train", *args], cwd=tmp_path)
     while not list(folder.glob("resume/[0-9]*")):
@@ -112,7 +113,7 @@ def test_a_killed_run_goes_on_from_its_last_evaluation(tmp_path):
 
 def test_a_run_that_is_asked_to_stop_says_how_to_go_on(tmp_path):
     folder = tmp_path / "logs" / "dqn" / "CartPole-v1_1"
-    args = ["-n", "100000", "--eval-freq", "300", "--eval-episodes", "1", *QUICK]
+    args = ["--algo", "dqn", "-n", "100000", "--eval-freq", "300", "--eval-episodes", "1", *QUICK]
     code = "from sb3_sparse.cli import main; main()"
     command = [sys.executable, "-c", code, "train", *args]
     running = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, text=True)
@@ -163,9 +164,11 @@ def test_options_and_a_second_run_beside_the_first(tmp_path):
         assert done.returncode == 0, done.stderr
         path = tmp_path / "else where" / "ppo" / f"CartPole-v1_{number}" / "CartPole-v1.zip"
         model = PPO.load(path)
-        last = done.stdout.splitlines()[-1]
-        assert shlex.split(last)[:2] == ["sb3-sparse", "inspect"]
-        assert shlex.split(last)[2].startswith(f"else where/ppo/CartPole-v1_{number}/")
+        folder = f"else where/ppo/CartPole-v1_{number}"
+        enjoy, export, study = map(shlex.split, done.stdout.splitlines()[-3:])
+        assert enjoy == ["sb3-sparse", "enjoy", folder]
+        assert export == ["sb3-sparse", "export", folder, "--to", "c", "policy.c"]
+        assert study == ["sb3-sparse", "study", "list"]
     assert model.n_envs == 2
     for layer in model.policy.sparse.layers:
         assert layer.nnz == layer.size - int(0.8 * layer.size + 1e-6)
@@ -186,8 +189,8 @@ def test_options_and_a_second_run_beside_the_first(tmp_path):
         (["--sparsity", "1.5"], "must lie in [0, 1)"),
         (["--distribution", "flat"], "allowed are er, erk, uniform"),
         (["-n", "0"], "must be 1 or more, got 0"),
-        (["--algo", "sac"], "sac cannot act in CartPole-v1"),
-        (["--env", "Pendulum-v1"], "dqn cannot act in Pendulum-v1"),
+        (["--algo", "sac", "--env", "CartPole-v1"], "sac cannot act in CartPole-v1"),
+        (["--algo", "dqn", "--env", "Pendulum-v1"], "dqn cannot act in Pendulum-v1"),
         (["--hyperparams", "gama:0.9"], "did you mean 'gamma'?"),
         (["--hyperparams", "gamma"], "given as name:value"),
         (["gamma:0.9"], "unexpected argument 'gamma:0.9'"),

@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.text import Text
 
 from sb3_sparse.errors import ConfigError
+from sb3_sparse.zoo.choice import chosen
 from sb3_sparse.zoo.overrides import parse_overrides
 from sb3_sparse.zoo.spec import RunSpec
 
@@ -37,8 +38,10 @@ def say(text: object, style: str | None = None) -> None:
     console.print(str(text), soft_wrap=True, style=style)
 
 
-Algo = Annotated[str, option("Algorithm: dqn, sac, ppo, td3, tqc, ...")]
-Env = Annotated[str, option("Gymnasium environment id, or package:Id.")]
+ALGO = "Algorithm: dqn, sac, ppo, td3, tqc, ..."
+ENV = "Gymnasium environment id, or package:Id."
+Algo = Annotated[str, option(ALGO)]
+Env = Annotated[str, option(ENV)]
 GymPackages = Annotated[
     list[str] | None,
     option(
@@ -105,8 +108,8 @@ def print_score(what: str, mean: float, std: float, path: Path) -> None:
 
 def run_spec(
     context: typer.Context,
-    algo: str,
-    env: str,
+    algo: str | None,
+    env: str | None,
     hyperparams: list[str] | None,
     gym_packages: list[str] | None,
     **options: Any,
@@ -114,12 +117,15 @@ def run_spec(
     """Make the specification of a run from the options of a command.
 
     :param context: holds the words left over by all other options
+    :param algo: algorithm; None: one that suits the environment
+    :param env: environment; None: one that suits the algorithm
     :param options: further fields of the specification
     :raises ConfigError: if a word belongs to no option, or a value is not allowed
     """
     values, packages = _values_and_packages(context.args, hyperparams, gym_packages)
+    algo, env = chosen(algo and algo.lower(), env, packages)
     return RunSpec(
-        algo=algo.lower(),
+        algo=algo,
         env_id=env,
         hyperparams=parse_overrides(values),
         gym_packages=tuple(packages),

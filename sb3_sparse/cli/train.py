@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sb3_sparse.cli.common import (
+    ALGO,
+    ENV,
     INTERRUPTED,
-    Algo,
     ConfFile,
     Device,
     Distribution,
-    Env,
     Envs,
     EvalEpisodes,
     EvalFreq,
@@ -27,23 +27,21 @@ from sb3_sparse.cli.common import (
     Steps,
     console,
     option,
-    print_score,
     run_spec,
     say,
 )
+from sb3_sparse.cli.outcome import tell
 from sb3_sparse.errors import ConfigError, command
 
 if TYPE_CHECKING:
     from sb3_sparse.zoo.results import Outcome
     from sb3_sparse.zoo.spec import RunSpec
 
-SHORT = 1e-3  # by how much rounding may miss a sparsity
-
 
 def train_command(
     context: typer.Context,
-    algo: Algo = "dqn",
-    env: Env = "CartPole-v1",
+    algo: Annotated[str | None, option(ALGO, shown="one that suits the environment")] = None,
+    env: Annotated[str | None, option(ENV, shown="one that suits the algorithm")] = None,
     method: Method = None,
     sparsity: Sparsity = None,
     distribution: Distribution = None,
@@ -71,7 +69,7 @@ def train_command(
         option("Resume an interrupted run: its folder. Takes no other option.", "--resume"),
     ] = None,
 ) -> None:
-    """Train, evaluate and save a sparse policy. Without arguments: DQN, RigL, 90 %, CartPole-v1."""
+    """Train, evaluate and save a sparse policy. Without arguments: SAC, RigL, 90 %, Pendulum-v1."""
     if resumed is not None:
         _reject_other_options(context)
         from sb3_sparse.zoo.training import resume
@@ -127,19 +125,7 @@ def _follow(headline: str, engine: Callable[..., Outcome]) -> None:
         say(f"Stopped after {outcome.model.num_timesteps} steps. Resume with:")
         say(command("train", "--resume", outcome.folder))
         raise typer.Exit(INTERRUPTED)
-    results = outcome.results
-    say(f"Sparsity {outcome.sparsity:.2%}. Return over {results[0].episodes} episodes:")
-    for result in results:
-        print_score(f"{result.what}:", result.mean_return, result.std_return, result.path)
-    if outcome.sparsity < outcome.wanted_sparsity - SHORT:
-        say(
-            f"The run should have reached {outcome.wanted_sparsity:.2%}, but too few mask updates "
-            "were due. Train longer, or with a smaller update_interval; reports leave this run out."
-        )
-    best = ["--best"] if len(results) > 1 else []
-    say("The best policy was chosen on other episodes. Look at it:" if best else "Look at it:")
-    say(command("enjoy", outcome.folder, *best))
-    say(command("inspect", results[-1].path))
+    tell(outcome)
 
 
 def _headline(run: RunSpec) -> str:

@@ -17,7 +17,7 @@ from sb3_sparse.pages.plot import save_png
 from sb3_sparse.policies.report import SparsityReport
 from sb3_sparse.zoo.archive import Archived
 from sb3_sparse.zoo.configs import DENSE
-from sb3_sparse.zoo.curve import curve
+from sb3_sparse.zoo.curve import CURVE, curve
 from sb3_sparse.zoo.folder import RunFolder, env_name
 from sb3_sparse.zoo.inspection import inspect_model
 from sb3_sparse.zoo.record import Record, Status
@@ -26,7 +26,6 @@ from sb3_sparse.zoo.spec import RunSpec
 from sb3_sparse.zoo.versions import NAME
 
 README = "README.md"
-CURVE = "curve.png"
 TASK = "reinforcement-learning"
 LIBRARY = "stable-baselines3"
 NOBODY = "YOUR-NAME"

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 
 from sb3_sparse.intervals import Array
 from sb3_sparse.pages.look import Look
-from sb3_sparse.pages.plot import Drawing, Sheet, styled
+from sb3_sparse.pages.plot import Drawing, Sheet, save_png, styled
+from sb3_sparse.zoo.archive import Archived
+from sb3_sparse.zoo.folder import RunFolder
 
+CURVE = "curve.png"
 HEADS = ("timesteps", "mean", "low", "high", "episodes")
 LOOK = Look("#0072b2", "o", "-")
 
@@ -29,3 +34,18 @@ def curve(title: str, timesteps: Array, returns: Array) -> Drawing:
         axes.set(title=title, xlabel="environment steps", ylabel="mean return")
         axes.ticklabel_format(axis="x", style="sci", scilimits=(-3, 4))
         return sheet.drawing()
+
+
+def write_curve(folder: RunFolder, title: str) -> Path | None:
+    """Write the learning curve of a run that has ended as ``curve.png`` into its folder.
+
+    :return: the file; None if the run was too short for an evaluation during training
+    :raises ConfigError: if the folder holds no run, or the run has not ended
+    :raises CorruptStateError: if a file is damaged
+    """
+    if not folder.evaluations.is_file():
+        return None
+    run = Archived.of_folder(folder, "")
+    path = folder.path / CURVE
+    save_png(path, curve(title, run.timesteps, run.returns).figure)
+    return path

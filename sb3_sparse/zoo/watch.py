@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable
+from datetime import timedelta
 from functools import partial
 from pathlib import Path
 from statistics import fmean
@@ -98,8 +99,19 @@ class TrainingLog(Watch):
         tenths = 10 * done // self.planned
         if tenths > self.tenths:
             self.tenths = tenths
-            self.say(f"{done} of {self.planned} steps, {self.status()}")
+            left = self.seconds_left()
+            time_left = f", {timedelta(seconds=round(left))} left" if left else ""
+            self.say(f"{done} of {self.planned} steps, {self.status()}{time_left}")
         return True
+
+    def seconds_left(self) -> float | None:
+        """Return the seconds that the rest of the training takes at its mean speed.
+
+        :return: None before the first step
+        """
+        done = timesteps_since_start(self.model)
+        left = self.planned - min(self.num_timesteps, self.planned)
+        return left * self._seconds() / done if done else None
 
     def status(self) -> str:
         """Return the mean return of recent episodes, the sparsity, and steps per second as text.
@@ -111,9 +123,11 @@ class TrainingLog(Watch):
         policy = unwrapped(self.model.policy)
         if isinstance(policy, BaseSparsePolicy):
             text += f", sparsity {policy.sparse.sparsity:.2%}"
-        seconds = (time.time_ns() - self.model.start_time) / 1e9
         done = timesteps_since_start(self.model)
-        return f"{text}, {done / seconds:.0f} steps/s" if done else text
+        return f"{text}, {done / self._seconds():.0f} steps/s" if done else text
+
+    def _seconds(self) -> float:
+        return (time.time_ns() - self.model.start_time) / 1e9
 
 
 def counting(tell: Callable[[int], None]) -> Callable[[dict[str, Any], dict[str, Any]], None]:

@@ -14,12 +14,20 @@ class Bar:
     :param console: where to print; without a terminal there is no bar
     :param unit: what is counted, e.g. ``"runs, {task.fields[status]}"``
     :param more: further columns
+    :param kind: Rich's ``Progress``, or a subclass of it
     :param options: further options of Rich's ``Progress``
     """
 
-    def __init__(self, console: Console, unit: str, *more: ProgressColumn, **options: Any) -> None:
+    def __init__(
+        self,
+        console: Console,
+        unit: str,
+        *more: ProgressColumn,
+        kind: type[Progress] = Progress,
+        **options: Any,
+    ) -> None:
         self.console = console
-        self.bar = Progress(
+        self.bar = kind(
             TextColumn("{task.description}", markup=False),
             BarColumn(bar_width=30),
             MofNCompleteColumn(),

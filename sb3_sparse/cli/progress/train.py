@@ -2,17 +2,46 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
-from rich.console import Console
-from rich.progress import TaskID, TimeElapsedColumn, TimeRemainingColumn
+from rich.console import Console, RenderableType
+from rich.progress import Progress, TaskID, TimeElapsedColumn, TimeRemainingColumn
+from rich.text import Text
 
 from sb3_sparse.cli.progress import Bar
 from sb3_sparse.zoo.match import Match
 from sb3_sparse.zoo.watch import TrainingLog
 
 REFRESH_STEPS = 100
+LEVELS = "▁▂▃▄▅▆▇█"
+
+
+def sparkline(values: Sequence[float], width: int = 30) -> str:
+    """Return the latest values as a row of blocks, from the lowest of them to the highest.
+
+    :param width: how many at most
+    """
+    shown = values[-width:]
+    if not shown:
+        return ""
+    low, high = min(shown), max(shown)
+    top = len(LEVELS) - 1
+    return "".join(
+        LEVELS[round(top * (value - low) / (high - low)) if high > low else top] for value in shown
+    )
+
+
+class WithLine(Progress):
+    """A bar with a line of text below it: the field ``line`` of its tasks."""
+
+    def get_renderables(self) -> Iterable[RenderableType]:
+        """Return the bar and the lines."""
+        yield from super().get_renderables()
+        for task in self.tasks:
+            yield Text(task.fields["line"], no_wrap=True, overflow="ellipsis")
 
 
 class EpisodesProgress(Bar):
@@ -25,7 +54,7 @@ class EpisodesProgress(Bar):
 
     def __init__(self, console: Console) -> None:
         apart = Console(file=console.file, highlight=False, markup=False)
-        kept = dict(transient=True, redirect_stdout=False, redirect_stderr=False)
+        kept: dict[str, Any] = dict(transient=True, redirect_stdout=False, redirect_stderr=False)
         super().__init__(apart, "episodes", TimeElapsedColumn(), **kept)
         self.tasks: dict[str, TaskID] = {}
 
@@ -43,7 +72,10 @@ class EpisodesProgress(Bar):
 
 
 class TrainingProgress(TrainingLog):
-    """The lines of a training, with a bar in place of the tenths if there is a terminal.
+    """The lines of a training; on a terminal, a live view in place of those of the tenths.
+
+    It shows a bar of the steps with the time left, and below it the return, the sparsity, the steps
+    a second, and the returns of all evaluations so far as a row of blocks.
 
     :param console: where to print
     :param headline: printed first, once the run is known to be possible
@@ -54,19 +86,25 @@ class TrainingProgress(TrainingLog):
         self.headline = headline
         self.folder: Path | None = None
         self.episodes = EpisodesProgress(console)
-        self.steps = Bar(console, "steps, {task.fields[status]}", TimeRemainingColumn())
+        self.returns: list[float] = []
+        left = TimeRemainingColumn()
+        self.steps = Bar(console, "steps, time left", left, kind=WithLine)
 
     def begins(self, folder: Path, match: Match | None) -> None:
         self.folder = folder
         self.say(self.headline)
         super().begins(folder, match)
 
+    def evaluated(self, step: int, mean: float, std: float, best: float | None) -> None:
+        super().evaluated(step, mean, std, best)
+        self.returns.append(mean)
+
     def plays(self, what: str, done: int, planned: int) -> None:
         self.episodes(what, done, planned)
 
     def _on_training_start(self) -> None:
         super()._on_training_start()
-        self.task = self.steps.bar.add_task("", total=self.planned, status=self.status())
+        self.task = self.steps.bar.add_task("", total=self.planned, line=self.line())
         self.steps.bar.start()
 
     def _on_step(self) -> bool:
@@ -74,12 +112,17 @@ class TrainingProgress(TrainingLog):
             return super()._on_step()
         done = min(self.num_timesteps, self.planned)
         if self.n_calls % REFRESH_STEPS == 0 or done == self.planned:
-            self.steps.bar.update(self.task, completed=done, status=self.status())
+            self.steps.bar.update(self.task, completed=done, line=self.line())
         return True
 
     def _on_training_end(self) -> None:
-        self.steps.bar.update(self.task, completed=self.planned, status=self.status())
+        self.steps.bar.update(self.task, completed=self.planned, line=self.line())
         self.close()
+
+    def line(self) -> str:
+        """Return the line below the bar."""
+        plain = not self.returns or self.steps.console.options.ascii_only
+        return self.status() + ("" if plain else f"  {sparkline(self.returns)}")
 
     def close(self) -> None:
         """Give the terminal back, also after an interruption."""
