@@ -21,7 +21,7 @@ TWO_LABELS = 5.5  # a range of this factor has two of 1, 2, 5, 10, ..
 ANY: Within = (-math.inf, math.inf)
 LEAST_FOR_BAND = 5
 SEED, RUN, BAND = "seed", "run", "band"  # mark what belongs to a line, for the legend
-THIN, BOLD, FAINT = 0.8, 1.8, 0.45
+THIN, BOLD, FAINT = 0.8, 1.8, 0.5
 MARKS = 4
 
 
@@ -69,7 +69,7 @@ def dots(axes: Axes, x: Sequence[float], y: Sequence[float], look: Look, each: s
     :param each: what a dot is, a seed or a run
     """
     axes.plot(
-        x, y, linestyle="", marker="o", markersize=3, color=look.color, alpha=FAINT,
+        x, y, linestyle="", marker="o", markersize=3.8, color=look.color, alpha=FAINT,
         markeredgewidth=0, gid=each,
     )  # fmt: skip
 

@@ -218,7 +218,7 @@ class Sheet:
             kinds = {dotted for mark, dotted in marks if mark == each}
             if kinds:
                 found[f"one {each}"] = Line2D(
-                    [], [], color=GREY, linewidth=THIN, alpha=0.9, markersize=3,
+                    [], [], color=GREY, linewidth=THIN, alpha=0.9, markersize=3.8,
                     linestyle="-" if False in kinds else "", marker="o" if True in kinds else "",
                 )  # fmt: skip
         if (BAND, False) in marks:
