@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import doctest
 import inspect
+import os
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 import textwrap
@@ -94,6 +96,70 @@ def test_the_example_of_the_readme_runs(capsys):
     assert small.count("150") == 1
     exec(compile(small, "README.md", "exec"), {})
     assert "sparsity: actor 0.9" in capsys.readouterr().out
+
+
+def test_the_example_of_the_first_page_runs(capsys):
+    (code,) = python_blocks("docs/index.md")
+    assert code.count("5_000") == 1
+    exec(compile(code.replace("5_000", "150"), "docs/index.md", "exec"), {})
+    assert "sparsity: actor 0.9" in capsys.readouterr().out
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory):
+    """The folder of somebody who followed the tutorial up to the board, and what was printed."""
+    text = (ROOT / "docs/tutorial.md").read_text()
+    folder = tmp_path_factory.mktemp("tutorial")
+    for kind, name in (("python", "docking.py"), ("c", "main.c")):
+        (code,) = re.findall(rf"```{kind}\n(.*?)```", text, re.DOTALL)
+        (folder / name).write_text(code)
+    shutil.copytree(ROOT / "examples/microcontroller", folder / "examples/microcontroller")
+    _, *steps, _ = tutorial_steps()
+    assert "".join(steps).count("-n 5000") == 1
+    said = shell("".join(steps).replace("-n 5000", "-n 300 --eval-episodes 2"), folder)
+    return folder, said
+
+
+def tutorial_steps() -> list[str]:
+    return re.findall(r"```sh\n(.*?)```", (ROOT / "docs/tutorial.md").read_text(), re.DOTALL)
+
+
+def shell(commands: str, folder: Path) -> str:
+    """Run commands as a user does who has installed this package."""
+    path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+    commands = re.sub(r"(PYTHONPATH=\S+)", rf"\1:{ROOT}", commands)
+    done = subprocess.run(
+        ["bash", "-euo", "pipefail", "-c", commands],
+        cwd=folder,
+        env={**os.environ, "PATH": path, "PYTHONPATH": f".:{ROOT}"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def test_a_user_follows_the_tutorial(flown):
+    folder, said = flown
+    assert re.search(r"Last policy: +-\d", said)
+    assert "exported" in said
+    start, *_, end = re.findall(r"step +(\d+): position +(\S+), push +(\S+)", said)
+    assert (start[0], start[1], end[0]) == ("0", "1.000", "100")
+    model = SAC.load(folder / "logs/sac/Docking-v0_1/Docking-v0.zip")
+    push, _ = model.predict(np.array([1.0, -0.5], np.float32), deterministic=True)
+    assert float(start[2]) == pytest.approx(push[0], abs=1e-3)
+
+
+@pytest.mark.skipif(
+    any(shutil.which(name) is None for name in ("arm-none-eabi-gcc", "qemu-system-arm", "make")),
+    reason="needs arm-none-eabi-gcc, qemu-system-arm and make",
+)
+def test_the_policy_of_the_tutorial_acts_alike_on_both_boards(flown):
+    install, *steps = tutorial_steps()[-1].splitlines(keepends=True)
+    assert install.startswith("sudo apt-get install")
+    said = shell("export PYTHONPATH=.\n" + "".join(steps), flown[0])
+    assert said.count("1000 actions differ from model.predict by") == 2
 
 
 def test_the_methods_by_network_of_the_documents_train():
