@@ -319,7 +319,7 @@ def train_commands() -> list[str]:
 
 
 def shell_lines() -> list[str]:
-    paths = ("README.md", "docs/configs.md", "docs/tuning.md")
+    paths = ("README.md", "docs/index.md", "docs/configs.md", "docs/tuning.md")
     text = "".join((ROOT / path).read_text() for path in paths)
     blocks = "".join(re.findall(r"```sh\n(.*?)```", text, re.DOTALL)).replace("\\\n", " ")
     return blocks.splitlines()
