@@ -114,6 +114,8 @@ def test_files_of_the_repository_that_pages_link_to_are_pages(site):
     )
     code = (site / "repository/examples/tour.py.html").read_text()
     assert "evaluate_policy" in words_of(code)
+    joining = words_of((site / "repository/CONTRIBUTING.html").read_text())
+    assert " 2. " not in joining  # all are items of lists
     changes = (site / "repository/CHANGELOG.html").read_text()
     assert 'href="../simba.html"' in changes
 
@@ -141,6 +143,13 @@ def test_a_file_has_one_page_and_a_page_one_file(path, uri):
     assert pages.site_uri("examples/microcontroller") == pages.site_uri(
         "examples/microcontroller/README.md"
     )
+
+
+def test_what_belongs_to_a_numbered_item_stays_in_it():
+    text = "1. One\n   line:\n\n   ```\n   a\n       b\n   ```\n2. Two\n\n- a\n  b\n"
+    lines = hook("pages").deeper(text).splitlines()
+    assert lines[1:7] == ["    line:", "", "    ```", "    a", "        b", "    ```"]
+    assert lines[7:] == ["", "2. Two", "", "- a", "  b"]
 
 
 def test_docstrings_become_markdown():

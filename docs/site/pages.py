@@ -35,7 +35,7 @@ LANGUAGES = {
     "app-config": "text",
 }
 LINK = re.compile(r"(\]\()([^)#\s]+)(#[^)\s]*)?(\))")
-FENCE = re.compile(r"^(```|~~~).*?^\1[^\n]*$", re.MULTILINE | re.DOTALL)
+FENCE = re.compile(r"^ *(```|~~~).*?^ *\1[^\n]*$", re.MULTILINE | re.DOTALL)
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
@@ -68,7 +68,7 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
         there = site_uri(resolved(path, target))
         return before + posixpath.relpath(there, posixpath.dirname(here)) + anchor + after
 
-    return outside_of_code(markdown, moved)
+    return deeper(outside_of_code(markdown, moved))
 
 
 def outside_of_code(markdown: str, change: Callable[[re.Match[str]], str]) -> str:
@@ -78,6 +78,23 @@ def outside_of_code(markdown: str, change: Callable[[re.Match[str]], str]) -> st
         parts += [LINK.sub(change, markdown[end : block.start()]), block[0]]
         end = block.end()
     return "".join([*parts, LINK.sub(change, markdown[end:])])
+
+
+def deeper(markdown: str) -> str:
+    """Markdown whose numbered lists indent by four, as the site reads them: a forge takes three.
+
+    Nor does the site see an item that follows the paragraph of another without an empty line.
+    """
+    lines: list[str] = []
+    inside = False
+    for line in markdown.splitlines():
+        if line and not line.startswith(" "):
+            item = re.match(r"\d+\. ", line) is not None
+            if inside and item and lines[-1].startswith(" "):
+                lines.append("")
+            inside = item
+        lines.append(" " + line if inside and line.startswith("   ") else line)
+    return "\n".join(lines)
 
 
 def resolved(path: str, target: str) -> str:
