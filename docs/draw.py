@@ -10,11 +10,13 @@ lines of the archive its blocks are, so that they can be checked while the archi
 from __future__ import annotations
 
 import argparse
+import math
 import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import product
 from pathlib import Path
 from statistics import fmean, median
 from tempfile import TemporaryDirectory
@@ -25,8 +27,11 @@ from sb3_sparse.pages.table import Cell, Table
 from sb3_sparse.report import FIGURES, FINDINGS, Results, Verdict, judge, read_runs
 from sb3_sparse.report.data import RunData
 from sb3_sparse.report.figures.findings import forest
-from sb3_sparse.report.methods import DENSE, EQUAL, name_of, percent
-from sb3_sparse.report.summary import scores, sentences
+from sb3_sparse.report.measured import snr_by_network
+from sb3_sparse.report.methods import DENSE, name_of, percent
+from sb3_sparse.report.statistics import Estimate, mean_difference
+from sb3_sparse.report.summary import LEAST, score_of, scores, sentences
+from sb3_sparse.report.verdicts import UNDECIDED
 from sb3_sparse.studies import Study, status_of
 from sb3_sparse.studies.cost import Costs
 from sb3_sparse.studies.status import CellStatus
@@ -63,6 +68,8 @@ PUBLISHED = {
     "SAC on MuJoCo": 1_000_000,
 }
 """Environment steps of the paper's runs."""
+MANY = 100
+"""Seeds beyond which no number is given."""
 
 
 @dataclass(frozen=True)
@@ -134,6 +141,7 @@ class Drawn:
             "scores": self._scores,
             "width": self._width,
             "comparison": self._comparison,
+            "snr": self._snr,
         }
         return "\n".join(made[what](*of)).rstrip() + "\n"
 
@@ -149,19 +157,35 @@ class Drawn:
         yield f"Drawn from the first {self.count:,} lines of the archive."
 
     def _verdicts(self) -> Iterator[str]:
-        """One row a finding: its verdict by the study with the most published steps."""
+        """How many findings are decided, and their rows, by the most steps with a verdict."""
+        rows = []
+        decided = set()
+        for finding in FINDINGS:
+            link = f"[{finding.text.removesuffix('.')}](#{finding.key})"
+            for one, shown in self._judged(finding.key):
+                by = f"{one.family}, {shown.steps:,} steps"
+                verdict = one.verdict
+                if verdict != UNDECIDED:
+                    decided.add(finding.key)
+                    verdict = f"**{verdict}**"
+                effect = f"{_number(one.effect or 0.0)} {_ends(one)}"
+                rows.append(f"| {link} | {verdict} | {effect} | {one.holds} | {one.seeds} | {by} |")
+            if not self._judged(finding.key):
+                begun = any(
+                    one.family and one.finding.key == finding.key
+                    for where in STUDIES[finding.key]
+                    for one in self.shown(*where).verdicts
+                )
+                why = "fewer than three seeds" if begun else "no runs yet"
+                rows.append(f"| {link} | {why} | | | | |")
+        yield (
+            f"**{len(decided)} of {len(FINDINGS)} findings are decided so far.** An effect without "
+            "a verdict says where it may lie, and no more."
+        )
+        yield ""
         yield "| the paper's finding | verdict | effect [95 % interval] | holds for | seeds | by |"
         yield "| --- | --- | --- | --- | --- | --- |"
-        for finding in FINDINGS:
-            known = [(one, shown) for one, shown in self._judged(finding.key)]
-            link = f"[{finding.text.removesuffix('.')}](#{finding.key})"
-            if not known:
-                yield f"| {link} | no runs yet | | | | |"
-            for one, shown in known:
-                effect = f"{_number(one.effect)} {_ends(one)}" if one.effect is not None else ""
-                by = f"{one.family}, {shown.steps:,} steps"
-                verdict = f"**{one.verdict}**" if one.verdict != "not enough data" else one.verdict
-                yield f"| {link} | {verdict} | {effect} | {one.holds} | {one.seeds or ''} | {by} |"
+        yield from rows
 
     def _judged(self, key: str) -> list[tuple[Verdict, Shown]]:
         """Return the verdicts on a finding that have an effect, one for each family of tasks."""
@@ -174,25 +198,44 @@ class Drawn:
         return list(found.values())
 
     def _finding(self, key: str) -> Iterator[str]:
-        for where in STUDIES[key]:
-            shown = self.shown(*where)
-            tested = [one for one in shown.verdicts if one.finding.key == key and one.family]
-            said = "; ".join(_said(one) for one in tested) or "no runs yet"
-            published = all(PUBLISHED.get(one.family) == shown.steps for one in tested)
-            steps = f"{shown.steps:,} steps" + (", as published" if tested and published else "")
-            yield f"- {shown.name}, {steps}: {said}.{self._missing(shown)}"
         drawn = self._judged(key)
-        if not drawn:
-            return
-        self.figures[f"finding-{key}"] = lambda: _forest(drawn, key)
-        (text,) = (one.text for one in FINDINGS if one.key == key)
-        yield ""
-        yield f"![{text} Effects with 95 % intervals.](figures/finding-{key}.svg)"
+        for one, shown in drawn:
+            published = " (as published)" if PUBLISHED.get(one.family) == shown.steps else ""
+            yield f"- {one.family}, {shown.steps:,} steps{published}: {_said(one)}"
+        if drawn:
+            self.figures[f"finding-{key}"] = lambda: _forest(drawn, key)
+            (text,) = (one.text for one in FINDINGS if one.key == key)
+            yield ""
+            yield f"![{text} Effects with 95 % intervals.](figures/finding-{key}.svg)"
+            yield ""
+        missing = [self.shown(*where) for where in STUDIES[key]]
+        texts = [f"{one.name} {self._costs.left(one.pending)}" for one in missing if one.pending]
+        if texts:
+            yield f"Still to be trained: {'; '.join(texts)}."
 
-    def _missing(self, shown: Shown) -> str:
-        if not shown.pending:
-            return ""
-        return f" Missing: {self._costs.left(shown.pending)}."
+    def _snr(self, name: str, scale: str) -> Iterator[str]:
+        """The ratio by sparsity, as a multiple of the dense network's."""
+        results = self.shown(name, scale).results
+        levels = sorted({run.level for run in results.main if run.level})
+        yield f"| task | {' | '.join(percent(level) for level in levels)} |"
+        yield f"| --- |{' --- |' * len(levels)}"
+        seeds: set[int] = set()
+        for env_id in sorted({run.env_id for run in results.main}):
+            logs = {
+                level: [
+                    fmean(math.log(ratio) for _, ratio in points)
+                    for run in results.main
+                    if (run.env_id, run.level) == (env_id, level)
+                    for points in snr_by_network(run.measured).values()
+                ]
+                for level in (0.0, *levels)
+            }
+            seeds |= {len(values) for values in logs.values()}
+            found = [mean_difference(logs[level], logs[0.0]) for level in levels]
+            texts = [" ".join(_multiple(one)) for one in found]
+            yield f"| {env_id} | {' | '.join(texts)} |"
+        yield ""
+        yield f"95 % Student t (Welch) intervals of the mean logarithm, {min(seeds)} seeds."
 
     def _comparison(self, name: str, scale: str, figure: str) -> Iterator[str]:
         """Sentences and one figure, for the README."""
@@ -225,39 +268,46 @@ class Drawn:
         heads = ["task", "network", "parameters", "return", "seconds of training"]
         rows = []
         for family in results.families():
+            levels = results.levels(family)
             for env_id in results.envs(family):
-                for label, level, runs in _networks(results, family, env_id):
-                    seconds = [run.seconds for run in runs if run.seconds is not None]
-                    rows.append(
-                        [
-                            env_id,
-                            name_of(label) if label == DENSE else f"{name_of(label)}, {level}",
-                            round(fmean(run.parameters for run in runs)),
-                            f"{short(fmean(run.score for run in runs), 3)} ({len(runs)})",
-                            short(median(seconds), 2) if seconds else None,
-                        ]
-                    )
+                for label, level in product(results.labels(family), (0.0, *levels)):
+                    runs = results.cell(family, env_id, label, level)
+                    if runs and (level == 0.0) == (label == DENSE):
+                        network = name_of(label)
+                        network += "" if label == DENSE else f", {percent(level)}"
+                        parameters = round(fmean(run.parameters for run in runs))
+                        rows.append([env_id, network, parameters, _returns(runs), _seconds(runs)])
         yield from _markdown(Table(heads, rows))
 
 
-def _networks(
-    results: Results, family: str, env_id: str
-) -> Iterator[tuple[str, str, list[RunData]]]:
-    for label in results.labels(family):
-        for level in [0.0] if label == DENSE else results.levels(family):
-            runs = results.cell(family, env_id, label, level)
-            if runs and (label in (DENSE, EQUAL, "static", "set", "rigl")):
-                yield label, percent(level), runs
+def _multiple(one: Estimate) -> tuple[str, str]:
+    return f"{math.exp(one.value):.2f}", f"[{math.exp(one.low):.2f}; {math.exp(one.high):.2f}]"
+
+
+def _returns(runs: Sequence[RunData]) -> str:
+    """Return the mean with its interval and the number of seeds, or the returns of one or two."""
+    if len(runs) < LEAST:
+        return ", ".join(short(run.score, 3) for run in runs)
+    one = score_of(runs, runs[0].env_id)
+    return f"{short(one.value, 3)} [{short(one.low, 3)}; {short(one.high, 3)}] ({one.seeds})"
+
+
+def _seconds(runs: Sequence[RunData]) -> str:
+    """Return the median, the range and the number of the runs that were timed."""
+    timed = [run.seconds for run in runs if run.seconds is not None]
+    if not timed:
+        return "not timed"
+    ends = f", {short(min(timed))} to {short(max(timed))}" if len(timed) > 1 else ""
+    return f"{short(median(timed))}{ends} ({len(timed)})"
 
 
 def _said(one: Verdict) -> str:
-    if one.effect is None:
-        return f"{one.family}: not enough data ({one.remark})"
-    text = f"{one.family}: **{one.verdict}**, {_number(one.effect)} {_ends(one)}"
-    text += f" of the {one.finding.unit}, n = {one.seeds} seeds in each of {one.strata} comparisons"
-    text += f" (holds for {one.holds})" if one.holds else ""
-    if one.verdict == "not enough data" and one.needed:
-        text += f"; {one.needed} seeds would decide it if the effect stays"
+    text = f"**{one.verdict}**, {_number(one.effect or 0.0)} {_ends(one)} of the {one.finding.unit}"
+    text += f", {one.seeds} seeds in each of {one.strata} comparisons; it holds for {one.holds}."
+    if one.verdict == UNDECIDED:
+        few = one.needed is not None and one.needed <= MANY
+        seeds = f"About {one.needed} seeds" if few else f"More than {MANY} seeds"
+        text += f" {seeds} would decide it if the effect stays."
     return text
 
 
@@ -268,7 +318,8 @@ def _ends(one: Verdict) -> str:
 
 
 def _number(value: float) -> str:
-    return f"{value:+.2f}"
+    """Write two decimals, or one digit of what would be rounded to nothing."""
+    return f"{value:+.1g}" if 0 < abs(value) < 0.005 else f"{value:+.2f}"
 
 
 def _markdown(table: Table) -> Iterator[str]:

@@ -170,6 +170,7 @@ def report(
         out or store / study.report_folder,
         title=f"{study.title} ({scale})",
         figures=study.figures,
+        findings=study.findings,
         varies=study.varies,
         command="\n".join((asked.command("run"), asked.command("report"))),
         archived=archived,

@@ -15,12 +15,14 @@ from sb3_sparse.pages.table import Cell, Table
 
 READABLE = 0.9  # CSS pixels a point
 STYLE = """
-:root { color-scheme: light dark; --line: #c8c8d0; --soft: #f3f3f7; --link: #362682; }
+:root { color-scheme: light dark; --page: #fff; --line: #c8c8d0; --soft: #f3f3f7;
+  --link: #362682; }
 @media (prefers-color-scheme: dark) {
-  :root { --line: #4a4a55; --soft: #26262e; --link: #b3a6ff; }
+  :root { --page: #121216; --line: #4a4a55; --soft: #26262e; --link: #b3a6ff; }
 }
 * { box-sizing: border-box; }
-body { font: 16px/1.5 system-ui, sans-serif; margin: 0 auto; max-width: 78rem; padding: 1rem; }
+body { background: var(--page); font: 16px/1.5 system-ui, sans-serif; margin: 0 auto;
+  max-width: 78rem; padding: 1rem; }
 h1 { font-size: 1.7rem; line-height: 1.2; } h2 { margin-top: 2.5rem; }
 h1, h2, h3, p, li, code, figcaption, summary { overflow-wrap: anywhere; }
 a { color: var(--link); }
@@ -38,6 +40,8 @@ th button:focus-visible { outline: 2px solid var(--link); outline-offset: -2px; 
 th[aria-sort="ascending"] button::after { content: " \\25B2"; }
 th[aria-sort="descending"] button::after { content: " \\25BC"; }
 td.number { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
+th:first-child, td:first-child { position: sticky; left: 0; background: var(--page); }
+th:first-child { background: var(--soft); }
 td.wide { min-width: 10.5rem; }
 td.good, td.bad, td.open { font-weight: 600; white-space: nowrap; }
 td.good::before { content: "\\2713  "; } td.bad::before { content: "\\2717  "; }

@@ -28,9 +28,12 @@ HOW = (
     "with most seeds."
 )
 INTERVALS = (
-    "Effect: difference of the two sides, with a 95 % stratified bootstrap interval, widened for "
-    "few seeds (by sqrt(n/(n-1)) and from normal to Student's t): with 3 seeds the plain "
-    "bootstrap is much too narrow. A comparison with fewer than "
+    "Effect: difference of the two sides, each pooled over all its runs: the interquartile mean, "
+    "for which the best and the worst quarter do not count, or the mean, as the unit says. Where a "
+    "side has several methods, their runs of one seed are averaged first. The "
+    "interval is a 95 % stratified bootstrap, widened for few seeds (by sqrt(n/(n-1)) and from "
+    "normal to Student's t): with 3 seeds the plain bootstrap is much too narrow. A comparison "
+    "with fewer than "
     f"{LEAST_SEEDS} seeds of either side does not count, and without any there is no verdict. "
     "Several findings are tested at 95 % each, with no correction. "
     '"Not enough data" is also the verdict if the interval decides nothing; then "seeds needed" '
@@ -136,15 +139,18 @@ def _scores(results: Results, hero: Sequence[Shown]) -> list[html.Section]:
 
 def _findings(content: Content) -> html.Section:
     tested = [one for one in content.verdicts if one.has_data]
-    silent = [one.finding.text.removesuffix(".") for one in content.verdicts if not one.has_data]
+    silent = [one.finding.text for one in content.verdicts if not one.has_data]
     parts = [html.paragraph(f"The findings are those of {PAPER}.")]
     if tested:
         parts += _shortened(findings_table(tested), "verdict")
     if silent:
-        parts.append(html.paragraph(f"No runs here compare: {'; '.join(silent)}."))
+        parts.append(html.paragraph("These runs have no data on:"))
+        parts.append(html.listing(silent))
+    asked = {one.finding.key for one in content.verdicts}
     rules = [
         f"{one.text} {one.rule}; {one.region.text}. At least {LEAST_SEEDS} seeds of both sides."
         for one in FINDINGS
+        if one.key in asked
     ]
     folded = html.folded("Rules", html.paragraph(INTERVALS), html.listing(rules))
     return html.section("Findings of the paper", *parts, folded)
@@ -154,8 +160,9 @@ def _cells(content: Content) -> html.Section:
     return html.section(
         "All cells",
         html.paragraph(
-            "The runs of a cell differ in their seeds alone. IQM and interval over its seeds, in "
-            "raw scores. Compared: whether figures and verdicts that compare methods take it."
+            "The runs of a cell differ in their seeds alone. IQM with its bootstrap interval, "
+            "which is too narrow for few seeds, in raw scores. Compared: whether figures and "
+            "verdicts that compare methods take it."
         ),
         *_shortened(_in_percent(content.cells)),
         html.paragraph("", *(html.link(name, name) for name in CSV_FILES)),

@@ -26,6 +26,7 @@ class Results:
 
     :param runs: as :func:`read_runs` returns them
     :param varies: name of the setting that was varied, for the figure ``"sensitivity"``
+    :param findings: keys of the findings of the paper to judge; None for all
 
     Example::
 
@@ -39,6 +40,7 @@ class Results:
 
     runs: tuple[RunData, ...]
     varies: str | None = None
+    findings: tuple[str, ...] | None = None
 
     @cached_property
     def trained(self) -> list[RunData]:

@@ -56,7 +56,7 @@ def _sentence(results: Results, family: str, env_id: str, level: float) -> str:
     runs = {
         label: results.cell(family, env_id, label, level) for label in results.labels(family, level)
     }
-    means = {label: _score(members, env_id) for label, members in runs.items() if members}
+    means = {label: score_of(members, env_id) for label, members in runs.items() if members}
     methods = [label for label in means if label not in PLAIN]
     best = max(methods, key=lambda label: means[label].value)
     named = {best: name_of(best), **{dense: PLAIN[dense] for dense in PLAIN if dense in means}}
@@ -66,8 +66,13 @@ def _sentence(results: Results, family: str, env_id: str, level: float) -> str:
         f"{name} {_interval(means[label], digits)}" + ("" if len(seeds) == 1 else _of(means[label]))
         for label, name in named.items()
     ]
+    others = [
+        name_of(one) for one in methods if one != best and means[one].value == means[best].value
+    ]
+    if others:
+        texts[0] += f", as {' and '.join(others)}"
     if len(methods) > 1:
-        texts[0] += f", the best of {len(methods)} sparse methods"
+        texts[0] += f", the highest mean of {len(methods)} sparse methods"
     end = f"; {_seeds(seeds.pop())}" if len(seeds) == 1 else ""
     return f"{_task(results, family, env_id)} at {percent(level)}: {'; '.join(texts)}{end}."
 
@@ -123,16 +128,16 @@ def _table(title: str, env_id: str, cells: Entries, varies: str | None) -> Score
     by_level = all(level < 0 for _, level in cells)
     columns = sorted({at for row in cells.values() for at in row}, key=order_of)
     means = {
-        (row, at): _score(runs, env_id) for row, by in cells.items() for at, runs in by.items()
+        (row, at): score_of(runs, env_id) for row, by in cells.items() for at, runs in by.items()
     }
     seeds = {one.seeds for one in means.values()}
     texts, best = {}, set()
     for at in columns:
         here = {row: means[row, at] for row in cells if (row, at) in means}
         digits = _digits([one.value for one in here.values()])
-        if len(here) > 1:
-            best |= {(row, at) for row, one in here.items() if one.value == max(
-                other.value for other in here.values())}  # fmt: skip
+        if len(here) > 1 and min(one.seeds for one in here.values()) >= LEAST:
+            highest = max(one.value for one in here.values())
+            best |= {(row, at) for row, one in here.items() if one.value == highest}
         for row, one in here.items():
             more = "" if len(seeds) == 1 else _of(one)
             texts[row, at] = f"{_interval(one, digits)}{more}"
@@ -154,11 +159,16 @@ def _table(title: str, env_id: str, cells: Entries, varies: str | None) -> Score
     heads = [percent(at) if by_level else str(at) for at in columns]
     what = "by sparsity" if by_level else f"by {varies}"
     common = f" over {_seeds(seeds.pop())}" if len(seeds) == 1 else ", with the number of seeds"
-    note = f"Mean scores {what}{common}, 95 % Student t intervals; the best of a column is bold."
+    bold = (
+        "; the highest of a column is bold, whether or not it can be told from others"
+        if best
+        else ""
+    )
+    note = f"Mean scores {what}{common}, 95 % Student t intervals from {LEAST} seeds on{bold}."
     return Scores(title, Table(["method", *heads], rows), note)
 
 
-def _score(runs: Sequence[RunData], env_id: str) -> Estimate:
+def score_of(runs: Sequence[RunData], env_id: str) -> Estimate:
     """Return the mean score, with an interval that holds no impossible return."""
     found = mean([run.score for run in runs])
     least, greatest = possible_returns(env_id)

@@ -83,8 +83,8 @@ def findings_table(verdicts: Sequence[Verdict]) -> Table:
     heads = ["finding of the paper", "verdict", "effect [95 % interval]", "holds for", "unit"]
     heads += ["seeds", "comparisons", "seeds needed", "algorithm and tasks", "remark"]
     rows: list[list[Any]] = [
-        [v.finding.text, v.verdict, _effect(v), v.holds or None, v.finding.unit, v.seeds]
-        + [v.strata, v.needed, v.family, v.remark or None]
+        [v.finding.text, v.verdict, _effect(v), v.holds or None, v.finding.unit, v.seeds or None]
+        + [v.strata or None, v.needed, v.family, v.remark or None]
         for v in verdicts
     ]
     return Table(heads, rows, marks=MARKS)

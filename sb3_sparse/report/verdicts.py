@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from sb3_sparse.errors import check_choice
 from sb3_sparse.pages.numbers import short
 from sb3_sparse.report.data import Array
 from sb3_sparse.report.results import Results
@@ -242,9 +243,14 @@ def judge(results: Results) -> list[Verdict]:
     """Judge each finding by each family of runs that has data on it.
 
     A finding without data has one verdict, "not enough data", that says what is missing.
+
+    :raises ConfigError: for an unknown key in the results' findings
     """
+    asked = [finding.key for finding in FINDINGS] if results.findings is None else results.findings
+    for key in asked:
+        check_choice("finding", key, [finding.key for finding in FINDINGS])
     found = []
-    for finding in FINDINGS:
+    for finding in (one for one in FINDINGS if one.key in asked):
         given = [(family, finding.sides(results, family)) for family in results.families()]
         known = [(family, sides) for family, sides in given if sides.x]
         if not known:

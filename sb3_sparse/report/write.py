@@ -25,6 +25,7 @@ def write_report(
     *,
     title: str,
     figures: Sequence[str],
+    findings: Sequence[str] | None = None,
     varies: str | None = None,
     command: str = "",
     pending: Sequence[str] = (),
@@ -41,6 +42,7 @@ def write_report(
     :param out: folder to write to
     :param title: title of the page
     :param figures: names of the figures, in order
+    :param findings: keys of the findings of the paper to judge; None for all that have data
     :param varies: setting that was varied, for the figure ``"sensitivity"``
     :param command: the command that continues what is pending
     :param pending: cells that are planned and not done
@@ -53,7 +55,7 @@ def write_report(
     if out.exists() and not out.is_dir():
         raise ConfigError(f"the report goes into a folder, and {out} is a file; give another name")
     runs, left_out = read_runs(folders, archived)
-    results = Results(tuple(runs), varies)
+    results = Results(tuple(runs), varies, None if findings is None else tuple(findings))
     found = judge(results)
     out.mkdir(parents=True, exist_ok=True)
     shown = [_figure(name, results, out / FOLDER) for name in dict.fromkeys(figures)]

@@ -53,6 +53,7 @@ class Study:
     :param figures: names of figures of :mod:`sb3_sparse.report`
     :param varies: the setting that the study varies; None: only method and sparsity
     :param cells: the cells to train, first seeds first
+    :param findings: keys of the findings of the paper that it tests; None: all on which it has data
     :param merged: names of cells that the file has more than once; they are trained once
     """
 
@@ -63,6 +64,7 @@ class Study:
     varies: str | None
     cells: tuple[Cell, ...]
     merged: tuple[str, ...] = ()
+    findings: tuple[str, ...] | None = None
 
     @classmethod
     def read(cls, what: str, scale: str, gym_packages: Sequence[str] = ()) -> Study:
@@ -82,6 +84,11 @@ class Study:
         figures, scales = content["figures"], content["scales"]
         if not figures or not isinstance(figures, list) or set(map(type, figures)) != {str}:
             raise ConfigError(f"{path}: figures must be a list of names, got {figures!r}")
+        findings = content.get("findings")
+        if findings is not None and (
+            not isinstance(findings, list) or not all(isinstance(one, str) for one in findings)
+        ):
+            raise ConfigError(f"{path}: findings must be a list of keys, got {findings!r}")
         if "sensitivity" in figures and "varies" not in content:
             raise ConfigError(f"{path}: the figure sensitivity needs varies, a setting's name")
         if not isinstance(scales, Mapping) or scale not in scales:
@@ -103,7 +110,8 @@ class Study:
             )
         title, varies = str(content["title"]), content.get("varies")
         _check_varies(varies, cells, path)
-        return cls(path.stem, scale, title, tuple(figures), varies, cells, merged)
+        tested = None if findings is None else tuple(findings)
+        return cls(path.stem, scale, title, tuple(figures), varies, cells, merged, tested)
 
     @property
     def report_folder(self) -> Path:

@@ -32,7 +32,7 @@ def test_the_first_sentence_tells_what_the_best_sparse_method_scores(folders):
     add(folders, "rigl", 0.9, [290.0, 290.0, 290.0])
     add(folders, "rigl", 0.99, [400.0, 400.0, 400.0])
     assert sentences(results(folders)) == [
-        "CartPole-v1 at 90 %: SET 310 [290; 330], the best of 2 sparse methods; dense 210 "
+        "CartPole-v1 at 90 %: SET 310 [290; 330], the highest mean of 2 sparse methods; dense 210 "
         "[190; 230]; dense of equal size 110 [85; 130]; 3 seeds."
     ]
 
@@ -58,21 +58,35 @@ def test_several_algorithms_are_named(folders):
     ]
 
 
-def test_a_table_has_a_row_for_each_method_and_the_best_of_a_column_in_bold(folders):
-    add(folders, "dense", None, [200.0])
-    add(folders, "set", 0.9, [300.0])
-    add(folders, "rigl", 0.9, [300.0])
-    add(folders, "equal", 0.9, [204.0])
-    add(folders, "rigl", 0.95, [100.0])
+def test_a_table_has_a_row_for_each_method_and_the_highest_of_a_column_in_bold(folders):
+    add(folders, "dense", None, [200.0] * 3)
+    add(folders, "set", 0.9, [300.0] * 3)
+    add(folders, "rigl", 0.9, [300.0] * 3)
+    add(folders, "equal", 0.9, [204.0] * 3)
+    add(folders, "rigl", 0.95, [100.0] * 3)
     (found,) = scores(results(folders))
     assert found.table.heads == ["method", "0 %", "90 %", "95 %"]
+    best = Cell(300.0, "300 [300; 300]", strong=True)
     assert found.table.rows == [
-        ["Dense", Cell(200.0, "200"), None, None],
-        ["Dense, equal parameters", None, Cell(204.0, "200"), None],
-        ["SET", None, Cell(300.0, "300", strong=True), None],
-        ["RigL", None, Cell(300.0, "300", strong=True), Cell(100.0, "100")],
+        ["Dense", Cell(200.0, "200 [200; 200]"), None, None],
+        ["Dense, equal parameters", None, Cell(204.0, "200 [200; 200]"), None],
+        ["SET", None, best, None],
+        ["RigL", None, best, Cell(100.0, "100 [100; 100]")],
     ]
-    assert "1 seed," in found.note
+    assert "3 seeds, 95 %" in found.note
+    assert "bold" in found.note
+    assert "SET 300 [300; 300], as RigL, the highest mean of 2" in sentences(results(folders))[0]
+
+
+def test_nothing_is_bold_below_three_seeds(folders):
+    add(folders, "set", 0.9, [300.0] * 3)
+    add(folders, "rigl", 0.9, [400.0] * 2)
+    (found,) = scores(results(folders))
+    assert found.table.rows == [
+        ["SET", Cell(300.0, "300 [300; 300] (3)")],
+        ["RigL", Cell(400.0, "400 (2)")],
+    ]
+    assert "bold" not in found.note
 
 
 def test_scores_that_would_tie_have_a_third_digit(folders):
@@ -81,7 +95,7 @@ def test_scores_that_would_tie_have_a_third_digit(folders):
     (found,) = scores(results(folders))
     assert [row[1] for row in found.table.rows] == [
         Cell(301.0, "301"),
-        Cell(304.0, "304", strong=True),
+        Cell(304.0, "304"),
     ]
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from sb3_sparse.errors import ConfigError
 from sb3_sparse.report import FINDINGS, Results, judge, read_runs
 from sb3_sparse.report.statistics import Estimate
 from sb3_sparse.report.verdicts import GREATER as GREATER_REGION
@@ -216,3 +217,12 @@ def test_the_runs_of_snr_are_those_of_the_highest_and_the_lowest_sparsity(folder
     (finding,) = [one for one in FINDINGS if one.key == "snr"]
     results = Results(tuple(runs))
     assert {run.folder for run in finding.sides(results, *results.families()).runs} == taken
+
+
+def test_only_the_findings_that_are_asked_for_are_judged(folders):
+    folders.add("static", 0.9)
+    runs, _ = read_runs(folders.made)
+    found = judge(Results(tuple(runs), findings=("noise", "erk")))
+    assert [one.finding.key for one in found] == ["erk", "noise"]
+    with pytest.raises(ConfigError, match=r"unknown finding 'nois' \(did you mean 'noise'"):
+        judge(Results(tuple(runs), findings=("nois",)))

@@ -50,8 +50,9 @@ class _Line:
     "Effects of what a finding compares. Diamonds: pooled over all cells compared, with the "
     "interval that the verdict is from. Circles: each of the cells compared alone, a difference of "
     "means with its 95 % Student t (Welch) interval; hollow, and not pooled, below three seeds of "
-    "a side. Long intervals are cut at the edge. Shaded: where the finding holds. The line marks "
-    "no effect. At the right: seeds of both sides, effect and interval.",
+    "a side. An arrowhead marks an interval that goes on beyond the edge. Shaded: where the "
+    "finding holds. The line marks no effect. At the right: seeds of both sides, effect and "
+    "interval.",
 )
 def draw(results: Results) -> Drawing:
     """Draw each finding on which there are data."""
@@ -130,6 +131,8 @@ def _panel(one: Axes, verdicts: Sequence[Verdict], blocks: list[list[_Line]]) ->
     low, high = min(*single, *pooled, 0.0), max(*single, *pooled, 0.0)
     pad = SPARE * ((high - low) or 1.0)
     one.set_xlim(low - pad, high + pad)
+    for place, line in enumerate(line for block in blocks for line in block):
+        _mark_cut(one, line, place)
     one.set_ylim(top - 0.4, -0.6)
     one.axvline(0.0, color=GREY, linewidth=1.0, zorder=1.5)
     one.set_yticks(range(top), texts)
@@ -163,11 +166,22 @@ def _draw(one: Axes, line: _Line, place: int) -> None:
     )  # fmt: skip
 
 
+def _mark_cut(one: Axes, line: _Line, place: int) -> None:
+    """Draw an arrowhead where an interval goes on beyond the edge."""
+    left, right = one.get_xlim()
+    inside = 0.02 * (right - left)
+    arrow = {"arrowstyle": "-|>", "color": POOLED if line.verdict else SINGLE}
+    if line.effect.low < left:
+        one.annotate("", (left, place), (left + inside, place), arrowprops=arrow)
+    if line.effect.high > right:
+        one.annotate("", (right, place), (right - inside, place), arrowprops=arrow)
+
+
 def _aside(line: _Line) -> str:
     """Return what stands at the right of a row."""
     x, y = line.counts
     effect = line.effect
-    ends = "" if math.isnan(effect.low) else f" [{_text(effect.low)}, {_text(effect.high)}]"
+    ends = "" if math.isnan(effect.low) else f" [{_text(effect.low)}; {_text(effect.high)}]"
     said = f"  {line.verdict}" if line.verdict else ""
     return f"{x} + {y} seeds  {_text(effect.value)}{ends}{said}"
 

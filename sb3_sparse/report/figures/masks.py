@@ -33,7 +33,12 @@ def draw(results: Results) -> Drawing:
     """Draw a row for each layer, with a panel for each method."""
     remarks: list[str] = []
     shown: list[tuple[RunData, dict[str, tuple[tuple[int, ...], Array]]]] = []
-    for run in _chosen(results):
+    chosen = _chosen(results)
+    with_model = [run for run in chosen if _model_of(run).is_file()]
+    if chosen and not with_model:
+        raise NotEnoughData("no model is in the runs' folders; an archive holds none")
+    remarks += [f"{run.folder}: its model is not there" for run in chosen if run not in with_model]
+    for run in with_model:
         try:
             masks = masks_of(run)
         except SparsityError as error:
@@ -107,14 +112,17 @@ def masks_of(run: RunData) -> dict[str, tuple[tuple[int, ...], Array]]:
     :raises ConfigError: if there is no model
     :raises CorruptStateError: if it is damaged
     """
-    path = Path(run.folder) / f"{env_name(run.env_id)}.zip"
-    state, found = plain_names(look_into(path).state), {}
+    state, found = plain_names(look_into(_model_of(run)).state), {}
     for layer in run.layers:
         mask = state.get(f"{layer['name']}.weight_mask")
         if mask is not None and mask.dim() > 1 and density_of(run, layer["name"]) < 1:
             flat = mask.reshape(mask.shape[0], -1).numpy().astype(np.float64)
             found[str(layer["name"])] = (tuple(mask.shape), blocks_of(flat))
     return found
+
+
+def _model_of(run: RunData) -> Path:
+    return Path(run.folder) / f"{env_name(run.env_id)}.zip"
 
 
 def density_of(run: RunData, name: str) -> float:
