@@ -59,18 +59,14 @@ def _sentence(results: Results, family: str, env_id: str, level: float) -> str:
     means = {label: score_of(members, env_id) for label, members in runs.items() if members}
     methods = [label for label in means if label not in PLAIN]
     best = max(methods, key=lambda label: means[label].value)
-    named = {best: name_of(best), **{dense: PLAIN[dense] for dense in PLAIN if dense in means}}
+    winners = " and ".join(name_of(label) for label in methods if means[label] == means[best])
+    named = {best: winners, **{dense: PLAIN[dense] for dense in PLAIN if dense in means}}
     digits = _digits([means[label].value for label in named])
     seeds = {means[label].seeds for label in named}
     texts = [
         f"{name} {_interval(means[label], digits)}" + ("" if len(seeds) == 1 else _of(means[label]))
         for label, name in named.items()
     ]
-    others = [
-        name_of(one) for one in methods if one != best and means[one].value == means[best].value
-    ]
-    if others:
-        texts[0] += f", as {' and '.join(others)}"
     if len(methods) > 1:
         texts[0] += f", the highest mean of {len(methods)} sparse methods"
     end = f"; {_seeds(seeds.pop())}" if len(seeds) == 1 else ""

@@ -75,7 +75,7 @@ def test_a_table_has_a_row_for_each_method_and_the_highest_of_a_column_in_bold(f
     ]
     assert "3 seeds, 95 %" in found.note
     assert "bold" in found.note
-    assert "SET 300 [300; 300], as RigL, the highest mean of 2" in sentences(results(folders))[0]
+    assert "SET and RigL 300 [300; 300], the highest mean of 2" in sentences(results(folders))[0]
 
 
 def test_nothing_is_bold_below_three_seeds(folders):
