@@ -10,6 +10,7 @@ lines of the archive its blocks are, so that they can be checked while the archi
 from __future__ import annotations
 
 import argparse
+import csv
 import math
 import re
 import sys
@@ -22,15 +23,15 @@ from statistics import fmean, median
 from tempfile import TemporaryDirectory
 
 from sb3_sparse.pages.numbers import short
-from sb3_sparse.pages.plot import Drawing, styled, svg_of
+from sb3_sparse.pages.plot import Axes, Drawing, Sheet, logarithmic, styled, svg_of
 from sb3_sparse.pages.table import Cell, Table
 from sb3_sparse.report import FIGURES, FINDINGS, Results, Verdict, judge, read_runs
 from sb3_sparse.report.data import RunData
 from sb3_sparse.report.figures.findings import forest
 from sb3_sparse.report.measured import snr_by_network
-from sb3_sparse.report.methods import DENSE, name_of, percent
+from sb3_sparse.report.methods import DENSE, EQUAL, look_of, name_of, percent
 from sb3_sparse.report.statistics import Estimate, mean_difference
-from sb3_sparse.report.summary import LEAST, score_of, scores, sentences
+from sb3_sparse.report.summary import LEAST, score_of, scores
 from sb3_sparse.report.verdicts import UNDECIDED
 from sb3_sparse.studies import Study, status_of
 from sb3_sparse.studies.cost import Costs
@@ -62,6 +63,17 @@ STUDIES: dict[str, tuple[tuple[str, str], ...]] = {
     "noise": (("noise", "medium"), ("noise", "small")),
 }
 """The studies that test each finding; of two with the same tasks, the first is drawn."""
+FRONT = ("classic_control", "small")
+"""The study of the README's picture."""
+SPEED = DOCS / "results/end_to_end.csv"
+CASES = (
+    ("SAC 256, 90 %", "sac-256", "0.9"),
+    ("SAC 1024, 95 %", "sac-1024", "0.95"),
+    ("TD3 256, 90 %", "td3-256", "0.9"),
+    ("DQN 512, 90 %", "dqn-512", "0.9"),
+    ("PPO 256, 90 %", "ppo-256", "0.9"),
+)
+"""Bars of the README's picture: their texts, and cases and sparsities of the benchmark."""
 PUBLISHED = {
     "DQN on classic control": 100_000,
     "PPO on MuJoCo": 1_000_000,
@@ -140,7 +152,7 @@ class Drawn:
             "finding": self._finding,
             "scores": self._scores,
             "width": self._width,
-            "comparison": self._comparison,
+            "front": self._front,
             "snr": self._snr,
         }
         return "\n".join(made[what](*of)).rstrip() + "\n"
@@ -237,13 +249,17 @@ class Drawn:
         yield ""
         yield f"95 % Student t (Welch) intervals of the mean logarithm, {min(seeds)} seeds."
 
-    def _comparison(self, name: str, scale: str, figure: str) -> Iterator[str]:
-        """Sentences and one figure, for the README."""
-        results = self.shown(name, scale).results
-        for text in sentences(results):
-            yield f"- {text}"
+    def _front(self) -> Iterator[str]:
+        """The picture of the README: speed, and return against parameters."""
+        shown = self.shown(*FRONT)
+        self.figures["front"] = lambda: _front(shown.results)
+        seeds = len({run.seed for run in shown.results.main})
+        yield "![learn() against SB3 and SBX; return against parameters](docs/figures/front.svg)"
         yield ""
-        yield self._picture(name, scale, figure, "docs/figures")
+        yield (
+            f"Left: measured with [this command](#how-it-compares). Right: DQN, {shown.steps:,} "
+            f"steps, {seeds} seeds: their [intervals](docs/findings.md) rank no methods yet."
+        )
 
     def _scores(self, name: str, scale: str, figure: str) -> Iterator[str]:
         shown = self.shown(name, scale)
@@ -278,6 +294,64 @@ class Drawn:
                         parameters = round(fmean(run.parameters for run in runs))
                         rows.append([env_id, network, parameters, _returns(runs), _seconds(runs)])
         yield from _markdown(Table(heads, rows))
+
+
+def _front(results: Results) -> Drawing:
+    """Draw bars of speed, and lines of normalised scores over both tasks with a dot a run."""
+    with styled():
+        sheet = Sheet((), 2, 2, 2.9, width=4.4)
+        _speed(sheet.axes[0])
+        _returns_by_size(sheet.axes[1], results)
+        sheet.figure.legend(loc="outside lower right", ncols=5)
+        return Drawing(sheet.figure, (), ())
+
+
+def _speed(one: Axes) -> None:
+    with SPEED.open(newline="") as file:
+        rows = {
+            (row["case"], row["sparsity"], row["contender"]): float(row["ratio"])
+            for row in csv.DictReader(file)
+            if row["ratio"]
+        }
+    for place, (_, case, sparsity) in enumerate(CASES):
+        ours = rows[case, sparsity, "ours"]
+        sbx = rows.get((case, "", "sbx"))
+        one.barh(place - 0.2, ours, 0.38, color=look_of("rigl").color)
+        one.text(ours, place - 0.2, f" {short(ours)}", va="center")
+        if sbx is not None:
+            one.barh(place + 0.2, sbx, 0.38, color=look_of(EQUAL).color)
+            one.text(sbx, place + 0.2, f" SBX {short(sbx)}", va="center")
+    one.set_yticks(range(len(CASES)), [text for text, *_ in CASES])
+    one.invert_yaxis()
+    one.axvline(1.0, color=look_of(DENSE).color, linestyle="--")
+    one.margins(x=0.15)
+    one.grid(visible=False, axis="y")
+    one.set(xlabel="multiples of SB3's speed (dashed)")
+    one.set_title("learn() with sb3_sparse, one thread", loc="left", weight="bold")
+
+
+def _returns_by_size(one: Axes, results: Results) -> None:
+    (family,) = results.families()
+    for label in (DENSE, EQUAL, "prune", "set", "rigl"):
+        look = look_of(label)
+        points = []
+        for level in [0.0] if label == DENSE else results.levels(family):
+            runs = [
+                run
+                for env_id in results.envs(family)
+                for run in results.cell(family, env_id, label, level)
+            ]
+            values = [score for run in runs if (score := results.normaliser(run)) is not None]
+            size = fmean(run.parameters for run in runs)
+            one.plot([size] * len(values), values, ".", color=look.color, alpha=0.35, markersize=5)
+            points.append((size, fmean(values)))
+        x, y = zip(*points, strict=True)
+        one.plot(
+            x, y, color=look.color, marker=look.marker, linestyle=look.line, label=name_of(label)
+        )
+    one.set(xlabel="active parameters", ylabel="mean normalised return")
+    logarithmic(one, "x")
+    one.set_title("DQN on CartPole and Acrobot", loc="left", weight="bold")
 
 
 def _multiple(one: Estimate) -> tuple[str, str]:

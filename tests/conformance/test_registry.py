@@ -92,7 +92,7 @@ def test_it_has_configs_and_a_place_in_the_documents(name):
     for method in METHODS:
         assert config_path(method, name.lower()).is_file()
     assert evaluation_of(name.lower(), "CartPole-v1", False)["eval_freq"] > 0
-    assert name in (ROOT / "README.md").read_text()
+    assert name in (ROOT / "docs/arguments.md").read_text()
 
 
 class InheritingSAC(stable_baselines3.SAC):
