@@ -21,6 +21,9 @@ from sb3_sparse.studies import Study, status_of
 from sb3_sparse.zoo import Archive
 
 ARCHIVE = Path(__file__).parents[2] / "docs/results/runs.jsonl"
+pytestmark = pytest.mark.skipif(
+    not ARCHIVE.is_file(), reason="a source distribution has no archive of runs"
+)
 RANDOM_AND_SOLVED = {"CartPole-v1": (22.0, 475.0), "Acrobot-v1": (-499.0, -100.0)}
 SEEDS, RESAMPLES, REPEATS = (0, 1, 2), 2000, 200
 MOVING = ("prune", "set", "rigl")
