@@ -62,7 +62,7 @@ STUDIES: dict[str, tuple[tuple[str, str], ...]] = {
     "snr": (("snr", "medium"), ("snr", "small")),
     "noise": (("noise", "medium"), ("noise", "small")),
 }
-"""The studies that test each finding; of two with the same tasks, the first is drawn."""
+"""The studies that test each finding."""
 FRONT = ("classic_control", "small")
 """The study of the README's picture."""
 SPEED = DOCS / "results/end_to_end.csv"
@@ -169,7 +169,7 @@ class Drawn:
         yield f"Drawn from the first {self.count:,} lines of the archive."
 
     def _verdicts(self) -> Iterator[str]:
-        """How many findings are decided, and their rows, by the most steps with a verdict."""
+        """How many findings are decided, and a row for each study that tests them."""
         rows = []
         decided = set()
         for finding in FINDINGS:
@@ -200,14 +200,14 @@ class Drawn:
         yield from rows
 
     def _judged(self, key: str) -> list[tuple[Verdict, Shown]]:
-        """Return the verdicts on a finding that have an effect, one for each family of tasks."""
-        found: dict[str, tuple[Verdict, Shown]] = {}
-        for where in STUDIES[key]:
-            shown = self.shown(*where)
-            for one in shown.verdicts:
-                if one.finding.key == key and one.effect is not None:
-                    found.setdefault(one.family, (one, shown))
-        return list(found.values())
+        """Return the verdicts on a finding that have an effect, study by study."""
+        return [
+            (one, shown)
+            for where in STUDIES[key]
+            for shown in [self.shown(*where)]
+            for one in shown.verdicts
+            if one.finding.key == key and one.effect is not None
+        ]
 
     def _finding(self, key: str) -> Iterator[str]:
         drawn = self._judged(key)
@@ -215,7 +215,7 @@ class Drawn:
             published = " (as published)" if PUBLISHED.get(one.family) == shown.steps else ""
             yield f"- {one.family}, {shown.steps:,} steps{published}: {_said(one)}"
         if drawn:
-            self.figures[f"finding-{key}"] = lambda: _forest(drawn, key)
+            self.figures[f"finding-{key}"] = lambda: _forest(_fullest(drawn), key)
             (text,) = (one.text for one in FINDINGS if one.key == key)
             yield ""
             yield f"![{text} Effects with 95 % intervals.](figures/finding-{key}.svg)"
@@ -377,7 +377,8 @@ def _seconds(runs: Sequence[RunData]) -> str:
 
 def _said(one: Verdict) -> str:
     text = f"**{one.verdict}**, {_number(one.effect or 0.0)} {_ends(one)} of the {one.finding.unit}"
-    text += f", {one.seeds} seeds in each of {one.strata} comparisons; it holds for {one.holds}."
+    each = f"each of {one.strata} comparisons" if one.strata > 1 else "one comparison"
+    text += f", {one.seeds} seeds in {each}; it holds for {one.holds}."
     if one.verdict == UNDECIDED:
         few = one.needed is not None and one.needed <= MANY
         seeds = f"About {one.needed} seeds" if few else f"More than {MANY} seeds"
@@ -407,6 +408,16 @@ def _text(entry: object) -> str:
     if isinstance(entry, Cell):
         return f"**{entry.text}**" if entry.strong else entry.text
     return "" if entry is None else f"{entry:,}" if isinstance(entry, int) else str(entry)
+
+
+def _fullest(drawn: Sequence[tuple[Verdict, Shown]]) -> list[tuple[Verdict, Shown]]:
+    """Return the verdict from the most comparisons and seeds of each algorithm and its tasks."""
+    found: dict[str, tuple[Verdict, Shown]] = {}
+    for one, shown in drawn:
+        before = found.get(one.family)
+        if before is None or one.strata * one.seeds > before[0].strata * before[0].seeds:
+            found[one.family] = one, shown
+    return list(found.values())
 
 
 def _forest(drawn: Sequence[tuple[Verdict, Shown]], key: str) -> Drawing:
