@@ -16,8 +16,6 @@ import csv
 import ctypes
 import subprocess
 import tempfile
-import time
-from collections.abc import Callable
 from importlib import util
 from pathlib import Path
 from statistics import median
@@ -34,64 +32,25 @@ from stable_baselines3 import SAC
 from sb3_sparse import SparsePolicy
 from sb3_sparse.export import export_policy
 from sb3_sparse.export.compiler import compiler
+from sb3_sparse.export.timing import OPTIONS, Burst, c_burst, looped, measure, with_loop
 from sb3_sparse.sparsity import equivalent_widths, mlp_parameters
 
 SIZES = ("17-256-256-6", "348-256-256-17", "348-1024-1024-17")
 SPARSITIES = (80, 90, 95, 99)
 OBSERVATIONS = 64
-BURST = 2e-3
-"""Seconds of one burst."""
-PLAIN = ("-std=c99", "-O3")
-NATIVE = (*PLAIN, "-march=native")
-LOOP = """
-#include <stdint.h>
-#include <time.h>
-void sb3_sparse_policy(const float *obs, float *action);
-double seconds(const float *obs, float *action, uint32_t size, uint32_t count)
-{
-    struct timespec start, end;
-    uint32_t i;
-    clock_gettime(CLOCK_MONOTONIC, &start);
-    for (i = 0; i < count; i++)
-        sb3_sparse_policy(obs + (i % OBSERVATIONS) * size, action);
-    clock_gettime(CLOCK_MONOTONIC, &end);
-    return (double)(end.tv_sec - start.tv_sec) + 1e-9 * (double)(end.tv_nsec - start.tv_nsec);
-}
-"""
-KINDS = {"C": PLAIN, "C, -O2": ("-std=c99", "-O2"), "C, -march=native": NATIVE}
-Burst = Callable[[int], float]
-"""Runs a number of actions; returns the seconds for all."""
+NATIVE = (*OPTIONS, "-march=native")
+KINDS = {"C": OPTIONS, "C, -O2": ("-std=c99", "-O2"), "C, -march=native": NATIVE}
 Variants = dict[str, tuple[Burst, int]]
 """A burst and the bytes of its policy, by name."""
 
 
-def looped(act: Callable[[Any], Any], observations: list[Any]) -> Burst:
-    """Make a burst of actions called from Python, one by one."""
-
-    def burst(count: int) -> float:
-        start = time.perf_counter()
-        for i in range(count):
-            act(observations[i % OBSERVATIONS])
-        return time.perf_counter() - start
-
-    return burst
-
-
-def built(source: Path, options: tuple[str, ...], name: str) -> tuple[Any, int]:
-    """Compile the policy with a loop around it; give the bytes of its code and constants too."""
-    folder = source.parent
-    (folder / "loop.c").write_text(LOOP.replace("OBSERVATIONS", f"{OBSERVATIONS}u"))
-    library, code = folder / f"{name}.so", folder / f"{name}.o"
-    cc = compiler()
-    subprocess.run([*cc, *options, "-c", str(source), "-o", str(code)], check=True)
-    loop = [str(folder / "loop.c"), "-D_POSIX_C_SOURCE=199309L"]
-    subprocess.run(
-        [*cc, *options, "-shared", "-fPIC", str(source), *loop, "-o", str(library), "-lm"],
-        check=True,
-    )
+def bytes_of(source: Path, options: tuple[str, ...]) -> int:
+    """Return the bytes of the code and constants of a policy."""
+    code = source.with_suffix(".o")
+    subprocess.run([*compiler(), *options, "-c", str(source), "-o", str(code)], check=True)
     said = subprocess.run(["size", str(code)], check=True, capture_output=True, text=True).stdout
     text, data, *_ = said.splitlines()[1].split()
-    return ctypes.CDLL(str(library)), int(text) + int(data)
+    return int(text) + int(data)
 
 
 def c_bursts(source: Path, rows: np.ndarray, actions: int, kinds: dict[str, Any]) -> Variants:
@@ -102,16 +61,11 @@ def c_bursts(source: Path, rows: np.ndarray, actions: int, kinds: dict[str, Any]
     where = action.ctypes.data_as(pointer)
     each = [row.ctypes.data_as(pointer) for row in rows]
     for number, (name, options) in enumerate(kinds.items()):
-        library, size = built(source, options, f"{source.stem}_{number}")
-        policy, seconds = library.sb3_sparse_policy, library.seconds
+        library = with_loop(source, options, f"{source.stem}_{number}")
+        policy, size = library.sb3_sparse_policy, bytes_of(source, options)
         policy.argtypes, policy.restype = [pointer, pointer], None
-        seconds.restype = ctypes.c_double
-
-        def burst(count: int, seconds: Any = seconds) -> float:
-            return float(seconds(each[0], where, rows.shape[1], count))
-
-        found[name] = (burst, size)
-        if options == PLAIN and source.stem == "sparse":
+        found[name] = (c_burst(library, rows, actions), size)
+        if options == OPTIONS and source.stem == "sparse":
             found["C through ctypes"] = (looped(lambda row, f=policy: f(row, where), each), size)
     return found
 
@@ -197,23 +151,9 @@ def variants(sizes: list[int], sparsity: float, folder: Path) -> Variants:
         "torch, dense": (looped(torch_act, [th.as_tensor(row)[None] for row in each]), weights),
         "numpy": (looped(policy, each), (folder / "sparse.npz").stat().st_size),
         **c_bursts(folder / "sparse.c", rows, sizes[-1], KINDS),
-        **c_bursts(folder / "int8.c", rows, sizes[-1], {"C, int8": PLAIN}),
-        **c_bursts(folder / "narrow.c", rows, sizes[-1], {"C, narrow dense": PLAIN}),
+        **c_bursts(folder / "int8.c", rows, sizes[-1], {"C, int8": OPTIONS}),
+        **c_bursts(folder / "narrow.c", rows, sizes[-1], {"C, narrow dense": OPTIONS}),
     }
-
-
-def measure(bursts: dict[str, Burst], rounds: int) -> dict[str, list[float]]:
-    """Measure seconds per action of each in turn, after a round that sets the size of bursts."""
-    counts = {}
-    for name, burst in bursts.items():
-        burst(20)
-        counts[name] = max(3, round(BURST / (burst(20) / 20)))
-    times: dict[str, list[float]] = {name: [] for name in bursts}
-    for _ in range(rounds):
-        for name, burst in bursts.items():
-            burst(3)  # what the one before has pushed out of the cache
-            times[name].append(burst(counts[name]) / counts[name])
-    return times
 
 
 def main() -> None:
@@ -235,7 +175,8 @@ def main() -> None:
                     units = [int(size) for size in sizes.split("-")]
                     found = variants(units, percent / 100, Path(folder))
                     bursts = {name: burst for name, (burst, _) in found.items()}
-                    times = measure(bursts, args.rounds)
+                    each = measure(list(bursts.values()), args.rounds)
+                times = dict(zip(bursts, each, strict=True))
                 base = next(iter(times.values()))
                 weights = found["torch, dense"][1]
                 for name, seconds in times.items():

@@ -10,7 +10,6 @@ lines of the archive its blocks are, so that they can be checked while the archi
 from __future__ import annotations
 
 import argparse
-import csv
 import math
 import re
 import sys
@@ -22,20 +21,23 @@ from pathlib import Path
 from statistics import fmean, median
 from tempfile import TemporaryDirectory
 
+from front import front
+
 from sb3_sparse.pages.numbers import short
-from sb3_sparse.pages.plot import Axes, Drawing, Sheet, logarithmic, styled, svg_of
+from sb3_sparse.pages.plot import Drawing, styled, svg_of
 from sb3_sparse.pages.table import Cell, Table
 from sb3_sparse.report import FIGURES, FINDINGS, Results, Verdict, judge, read_runs
 from sb3_sparse.report.data import RunData
+from sb3_sparse.report.figures import draw
 from sb3_sparse.report.figures.findings import forest
+from sb3_sparse.report.findings import UNDECIDED
 from sb3_sparse.report.measured import snr_by_network
-from sb3_sparse.report.methods import DENSE, EQUAL, look_of, name_of, percent
+from sb3_sparse.report.methods import DENSE, name_of, percent
 from sb3_sparse.report.statistics import Estimate, mean_difference
 from sb3_sparse.report.summary import LEAST, score_of, scores
-from sb3_sparse.report.verdicts import UNDECIDED
 from sb3_sparse.studies import Study, status_of
 from sb3_sparse.studies.cost import Costs
-from sb3_sparse.studies.status import CellStatus
+from sb3_sparse.studies.status import CellStatus, readable
 from sb3_sparse.zoo.archive import Archive
 
 DOCS = Path(__file__).parent
@@ -45,35 +47,25 @@ DOCUMENTS = (DOCS / "findings.md", DOCS.parent / "README.md")
 BLOCK = re.compile(r"(<!-- drawn: ([^>]*?) -->\n).*?(<!-- end -->)", re.DOTALL)
 LINES = re.compile(r"first ([\d,]+) lines of the archive")
 
-COMPARED = (
+STUDIES = (
     ("classic_control", "medium"),
     ("classic_control", "small"),
     ("ppo", "medium"),
     ("ppo", "small"),
     ("sac", "medium"),
+    ("distribution", "medium"),
+    ("distribution", "small"),
+    ("actor_critic", "small"),
+    ("weight_decay", "medium"),
+    ("weight_decay", "small"),
+    ("snr", "medium"),
+    ("snr", "small"),
+    ("noise", "medium"),
+    ("noise", "small"),
 )
-STUDIES: dict[str, tuple[tuple[str, str], ...]] = {
-    "equal-parameters": COMPARED,
-    "no-loss": COMPARED,
-    "rigl-set": COMPARED,
-    "erk": (("distribution", "medium"), ("distribution", "small")),
-    "critic": (("actor_critic", "small"),),
-    "weight-decay": (("weight_decay", "medium"), ("weight_decay", "small")),
-    "snr": (("snr", "medium"), ("snr", "small")),
-    "noise": (("noise", "medium"), ("noise", "small")),
-}
-"""The studies that test each finding."""
+"""The studies that test the findings, and their scales."""
 FRONT = ("classic_control", "small")
 """The study of the README's picture."""
-SPEED = DOCS / "results/end_to_end.csv"
-CASES = (
-    ("SAC 256, 90 %", "sac-256", "0.9"),
-    ("SAC 1024, 95 %", "sac-1024", "0.95"),
-    ("TD3 256, 90 %", "td3-256", "0.9"),
-    ("DQN 512, 90 %", "dqn-512", "0.9"),
-    ("PPO 256, 90 %", "ppo-256", "0.9"),
-)
-"""Bars of the README's picture: their texts, and cases and sparsities of the benchmark."""
 PUBLISHED = {
     "DQN on classic control": 100_000,
     "PPO on MuJoCo": 1_000_000,
@@ -98,13 +90,12 @@ class Shown:
     @cached_property
     def results(self) -> Results:
         """The finished runs."""
-        lines = {one.folder.path: one.archived for one in self.statuses if one.archived}
-        runs, _ = read_runs([], lines)
-        return Results(tuple(runs), self.study.varies)
+        runs, _ = read_runs(*readable(self.statuses))
+        return Results(tuple(runs), self.study.varies, self.study.findings)
 
     @cached_property
     def verdicts(self) -> list[Verdict]:
-        """The verdicts on all findings."""
+        """The verdicts on the findings that the study tests."""
         return judge(self.results)
 
     @property
@@ -150,6 +141,7 @@ class Drawn:
             "archive": self._archive,
             "verdicts": self._verdicts,
             "finding": self._finding,
+            "missing": self._missing,
             "scores": self._scores,
             "width": self._width,
             "front": self._front,
@@ -180,12 +172,12 @@ class Drawn:
                 if verdict != UNDECIDED:
                     decided.add(finding.key)
                     verdict = f"**{verdict}**"
-                effect = f"{_number(one.effect or 0.0)} {_ends(one)}"
-                rows.append(f"| {link} | {verdict} | {effect} | {one.holds} | {one.seeds} | {by} |")
+                cells = (link, verdict, one.shown, one.holds, str(one.seeds), by)
+                rows.append(f"| {' | '.join(cells)} |")
             if not self._judged(finding.key):
                 begun = any(
-                    one.family and one.finding.key == finding.key
-                    for where in STUDIES[finding.key]
+                    one.has_data and one.finding.key == finding.key
+                    for where in STUDIES
                     for one in self.shown(*where).verdicts
                 )
                 why = "fewer than three seeds" if begun else "no runs yet"
@@ -203,7 +195,7 @@ class Drawn:
         """Return the verdicts on a finding that have an effect, study by study."""
         return [
             (one, shown)
-            for where in STUDIES[key]
+            for where in STUDIES
             for shown in [self.shown(*where)]
             for one in shown.verdicts
             if one.finding.key == key and one.effect is not None
@@ -219,11 +211,18 @@ class Drawn:
             (text,) = (one.text for one in FINDINGS if one.key == key)
             yield ""
             yield f"![{text} Effects with 95 % intervals.](figures/finding-{key}.svg)"
-            yield ""
-        missing = [self.shown(*where) for where in STUDIES[key]]
-        texts = [f"{one.name} {self._costs.left(one.pending)}" for one in missing if one.pending]
-        if texts:
-            yield f"Still to be trained: {'; '.join(texts)}."
+        else:
+            yield "No study has three seeds of both sides yet."
+
+    def _missing(self) -> Iterator[str]:
+        """What each study lacks, and what that costs."""
+        yield "| study | tests | still to be trained |"
+        yield "| --- | --- | --- |"
+        for where in STUDIES:
+            shown = self.shown(*where)
+            if shown.pending:
+                links = ", ".join(f"[{key}](#{key})" for key in shown.study.findings or ())
+                yield f"| {shown.name} | {links} | {self._costs.left(shown.pending)} |"
 
     def _snr(self, name: str, scale: str) -> Iterator[str]:
         """The ratio by sparsity, as a multiple of the dense network's."""
@@ -252,7 +251,7 @@ class Drawn:
     def _front(self) -> Iterator[str]:
         """The picture of the README: speed, and return against parameters."""
         shown = self.shown(*FRONT)
-        self.figures["front"] = lambda: _front(shown.results)
+        self.figures["front"] = lambda: front(shown.results)
         seeds = len({run.seed for run in shown.results.main})
         yield "![learn() against SB3 and SBX; return against parameters](docs/figures/front.svg)"
         yield ""
@@ -275,7 +274,7 @@ class Drawn:
     def _picture(self, name: str, scale: str, figure: str, folder: str) -> str:
         shown = self.shown(name, scale)
         file = f"{name}-{scale}-{figure}"
-        self.figures[file] = lambda: _draw(figure, shown.results)
+        self.figures[file] = lambda: draw(figure, shown.results)
         return f"![{FIGURES[figure].title}: {shown.study.title}.]({folder}/{file}.svg)"
 
     def _width(self, name: str, scale: str) -> Iterator[str]:
@@ -294,64 +293,6 @@ class Drawn:
                         parameters = round(fmean(run.parameters for run in runs))
                         rows.append([env_id, network, parameters, _returns(runs), _seconds(runs)])
         yield from _markdown(Table(heads, rows))
-
-
-def _front(results: Results) -> Drawing:
-    """Draw bars of speed, and lines of normalised scores over both tasks with a dot a run."""
-    with styled():
-        sheet = Sheet((), 2, 2, 2.9, width=4.4)
-        _speed(sheet.axes[0])
-        _returns_by_size(sheet.axes[1], results)
-        sheet.figure.legend(loc="outside lower right", ncols=5)
-        return Drawing(sheet.figure, (), ())
-
-
-def _speed(one: Axes) -> None:
-    with SPEED.open(newline="") as file:
-        rows = {
-            (row["case"], row["sparsity"], row["contender"]): float(row["ratio"])
-            for row in csv.DictReader(file)
-            if row["ratio"]
-        }
-    for place, (_, case, sparsity) in enumerate(CASES):
-        ours = rows[case, sparsity, "ours"]
-        sbx = rows.get((case, "", "sbx"))
-        one.barh(place - 0.2, ours, 0.38, color=look_of("rigl").color)
-        one.text(ours, place - 0.2, f" {short(ours)}", va="center")
-        if sbx is not None:
-            one.barh(place + 0.2, sbx, 0.38, color=look_of(EQUAL).color)
-            one.text(sbx, place + 0.2, f" SBX {short(sbx)}", va="center")
-    one.set_yticks(range(len(CASES)), [text for text, *_ in CASES])
-    one.invert_yaxis()
-    one.axvline(1.0, color=look_of(DENSE).color, linestyle="--")
-    one.margins(x=0.15)
-    one.grid(visible=False, axis="y")
-    one.set(xlabel="multiples of SB3's speed (dashed)")
-    one.set_title("learn() with sb3_sparse, one thread", loc="left", weight="bold")
-
-
-def _returns_by_size(one: Axes, results: Results) -> None:
-    (family,) = results.families()
-    for label in (DENSE, EQUAL, "prune", "set", "rigl"):
-        look = look_of(label)
-        points = []
-        for level in [0.0] if label == DENSE else results.levels(family):
-            runs = [
-                run
-                for env_id in results.envs(family)
-                for run in results.cell(family, env_id, label, level)
-            ]
-            values = [score for run in runs if (score := results.normaliser(run)) is not None]
-            size = fmean(run.parameters for run in runs)
-            one.plot([size] * len(values), values, ".", color=look.color, alpha=0.35, markersize=5)
-            points.append((size, fmean(values)))
-        x, y = zip(*points, strict=True)
-        one.plot(
-            x, y, color=look.color, marker=look.marker, linestyle=look.line, label=name_of(label)
-        )
-    one.set(xlabel="active parameters", ylabel="mean normalised return")
-    logarithmic(one, "x")
-    one.set_title("DQN on CartPole and Acrobot", loc="left", weight="bold")
 
 
 def _multiple(one: Estimate) -> tuple[str, str]:
@@ -376,25 +317,14 @@ def _seconds(runs: Sequence[RunData]) -> str:
 
 
 def _said(one: Verdict) -> str:
-    text = f"**{one.verdict}**, {_number(one.effect or 0.0)} {_ends(one)} of the {one.finding.unit}"
-    each = f"each of {one.strata} comparisons" if one.strata > 1 else "one comparison"
+    text = f"**{one.verdict}**, {one.shown} of the {one.finding.unit}"
+    each = f"each of {one.comparisons} comparisons" if one.comparisons > 1 else "one comparison"
     text += f", {one.seeds} seeds in {each}; it holds for {one.holds}."
     if one.verdict == UNDECIDED:
         few = one.needed is not None and one.needed <= MANY
         seeds = f"About {one.needed} seeds" if few else f"More than {MANY} seeds"
         text += f" {seeds} would decide it if the effect stays."
     return text
-
-
-def _ends(one: Verdict) -> str:
-    assert one.low is not None
-    assert one.high is not None
-    return f"[{_number(one.low)}; {_number(one.high)}]"
-
-
-def _number(value: float) -> str:
-    """Write two decimals, or one digit of what would be rounded to nothing."""
-    return f"{value:+.1g}" if 0 < abs(value) < 0.005 else f"{value:+.2f}"
 
 
 def _markdown(table: Table) -> Iterator[str]:
@@ -415,7 +345,7 @@ def _fullest(drawn: Sequence[tuple[Verdict, Shown]]) -> list[tuple[Verdict, Show
     found: dict[str, tuple[Verdict, Shown]] = {}
     for one, shown in drawn:
         before = found.get(one.family)
-        if before is None or one.strata * one.seeds > before[0].strata * before[0].seeds:
+        if before is None or one.comparisons * one.seeds > before[0].comparisons * before[0].seeds:
             found[one.family] = one, shown
     return list(found.values())
 
@@ -430,11 +360,6 @@ def _forest(drawn: Sequence[tuple[Verdict, Shown]], key: str) -> Drawing:
     ]
     with styled():
         return forest(Results(tuple(runs)), [one for one, _ in drawn], [key])
-
-
-def _draw(name: str, results: Results) -> Drawing:
-    with styled():
-        return FIGURES[name].draw(results)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -458,8 +383,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         path.write_text(text, encoding="utf-8")
     folder = DOCS / "figures"
     folder.mkdir(exist_ok=True)
-    for name, draw in drawn.figures.items():
-        (folder / f"{name}.svg").write_bytes(svg_of(draw().figure))
+    for name, drawing in drawn.figures.items():
+        (folder / f"{name}.svg").write_bytes(svg_of(drawing().figure))
     for old in set(folder.glob("*.svg")) - {folder / f"{name}.svg" for name in drawn.figures}:
         old.unlink()
     print(f"{len(drawn.figures)} figures and the blocks of {len(new)} documents are drawn")

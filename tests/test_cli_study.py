@@ -63,6 +63,13 @@ def test_an_unknown_figure_is_known_before_anything_is_run(tmp_path, mistake):
     assert not (tmp_path / "studies").exists()
 
 
+def test_an_unknown_finding_is_known_before_anything_is_run(tmp_path, mistake):
+    (tmp_path / "mine.yml").write_text(yaml.safe_dump({**CELLS, "findings": ["nois"]}))
+    said = mistake("study", "run", "mine.yml", "--scale", "smoke")
+    assert "unknown finding 'nois' (did you mean 'noise'?); allowed are equal-parameters" in said
+    assert not (tmp_path / "studies").exists()
+
+
 def test_a_report_of_nothing_is_a_mistake_and_makes_nothing(tmp_path, mistake):
     said = mistake("study", "report", "flops", "--folder", "elsewhere")
     assert "there is no run of this study in elsewhere yet; start with: sb3-sparse study" in said

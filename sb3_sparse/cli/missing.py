@@ -6,7 +6,6 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 from sb3_sparse.errors import MissingExtra
-from sb3_sparse.pages.numbers import short
 from sb3_sparse.studies.cost import Cost, Costs, but_for_seeds
 from sb3_sparse.studies.status import CellState, CellStatus, readable
 
@@ -35,11 +34,15 @@ def costs_of(statuses: Sequence[CellStatus], costs: Costs) -> Iterator[str]:
         yield COUNTED
 
 
-def findings_of(statuses: Sequence[CellStatus], costs: Costs) -> Iterator[str]:
-    """Yield a line for each finding of the paper on which the done cells have data.
+def findings_of(
+    statuses: Sequence[CellStatus], costs: Costs, findings: tuple[str, ...] | None
+) -> Iterator[str]:
+    """Yield a line for each finding that a study tests and on which its done cells have data.
 
     A line gives the verdict, or what it probably needs. Without the extra for reports, there is
     one line that names it.
+
+    :param findings: keys of the findings; None for all of the paper
     """
     if not any(one.state is CellState.DONE for one in statuses):
         return
@@ -49,7 +52,7 @@ def findings_of(statuses: Sequence[CellStatus], costs: Costs) -> Iterator[str]:
         yield f"No verdicts: {error}"
         return
     runs, _ = read_runs(*readable(statuses))
-    results = Results(tuple(runs))
+    results = Results(tuple(runs), findings=findings)
     verdicts = [one for one in judge(results) if one.has_data]
     if verdicts:
         yield "Findings of the paper on which there are data:"
@@ -59,16 +62,13 @@ def findings_of(statuses: Sequence[CellStatus], costs: Costs) -> Iterator[str]:
 
 
 def _told(one: Verdict) -> str:
-    if one.effect is None or one.low is None or one.high is None:
-        return one.verdict
-    sign = "+" if one.effect > 0 else ""
-    interval = f"[{short(one.low)}; {short(one.high)}]"
-    return f"{one.verdict}, {sign}{short(one.effect)} {interval}, {one.seeds} seeds"
+    return f"{one.verdict}, {one.shown}, {one.seeds} seeds" if one.shown else one.verdict
 
 
 def _needed(one: Verdict, results: Results, statuses: Sequence[CellStatus], costs: Costs) -> str:
     """Say what an open verdict needs; nothing for the others."""
-    from sb3_sparse.report.verdicts import LEAST_SEEDS, UNDECIDED
+    from sb3_sparse.report.findings import UNDECIDED
+    from sb3_sparse.report.verdicts import LEAST_SEEDS
 
     if one.verdict != UNDECIDED:
         return ""

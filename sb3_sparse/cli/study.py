@@ -71,7 +71,7 @@ def run(
     from sb3_sparse.studies import run_study  # not for a mistyped name
 
     if Path(name).suffix:
-        _check_figures(study)
+        _check_page(study)
     _say_merged(study)
     runner = run_study(study, store, chosen, workers, archive)
     shown = StudyProgress(console)
@@ -137,7 +137,7 @@ def status(
             say(f"diverged: {one.cell.name}, at step {one.steps}")
         if one.state is CellState.FAILED:
             say(f"failed: {one.cell.name}; {one.why(store)}")
-    for line in findings_of(statuses, costs):
+    for line in findings_of(statuses, costs, study.findings):
         say(line)
 
 
@@ -185,13 +185,15 @@ def _say_merged(study: Study) -> None:
         say(f"note: listed more than once, but trained once: {names}")
 
 
-def _check_figures(study: Study) -> None:
-    """Reject unknown figures before the runs, if the extra for reports is installed."""
+def _check_page(study: Study) -> None:
+    """Reject unknown figures and findings before the runs, if the extra for reports is there."""
     try:
         from sb3_sparse.report.figures import check_figures
+        from sb3_sparse.report.findings import check_findings
     except MissingExtra:
         return
     check_figures(study.figures)
+    check_findings(study.findings or ())
 
 
 def _pending(one: CellStatus, store: Path) -> str:

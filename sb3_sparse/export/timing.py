@@ -6,10 +6,11 @@ import ctypes
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -76,17 +77,10 @@ def acting_cost(model: BaseAlgorithm) -> ActingCost:
     observations = random_observations(space, model.get_vec_normalize_env(), OBSERVATIONS)
     with tempfile.TemporaryDirectory() as folder:
         report = export_policy(model, Path(folder) / "policy", "c")
-        in_c = c_burst(
-            Path(folder) / "policy.c", np.asarray(observations, np.float32), size_of(model)
-        )
-
-        def predict(count: int) -> float:
-            start = time.thread_time()
-            for i in range(count):
-                model.predict(observations[i % OBSERVATIONS], deterministic=True)
-            return time.thread_time() - start
-
-        c, by_predict = medians(in_c, predict)
+        library = with_loop(Path(folder) / "policy.c")
+        in_c = c_burst(library, np.asarray(observations, np.float32), size_of(model))
+        predict = looped(lambda row: model.predict(row, deterministic=True), observations)
+        c, by_predict = map(median, measure([in_c, predict]))
     return ActingCost(1e6 * c, 1e6 * by_predict, report.sizes["flash"], report.dense_bytes)
 
 
@@ -95,25 +89,48 @@ def size_of(model: BaseAlgorithm) -> int:
     return int(np.prod(model.action_space.shape or ()))
 
 
-def c_burst(
-    source: Path, rows: np.ndarray, actions: int, options: tuple[str, ...] = OPTIONS
-) -> Burst:
+def looped(act: Callable[[Any], Any], observations: Sequence[Any]) -> Burst:
+    """Make a burst of actions called from Python, one by one.
+
+    :param act: takes one observation
+    :param observations: taken in turn
+    """
+
+    def burst(count: int) -> float:
+        start = time.thread_time()
+        for i in range(count):
+            act(observations[i % len(observations)])
+        return time.thread_time() - start
+
+    return burst
+
+
+def with_loop(source: Path, options: tuple[str, ...] = OPTIONS, name: str = "") -> ctypes.CDLL:
     """Compile a policy in C with a loop around it, beside the file.
 
     :param source: the policy's ``.c`` file
-    :param rows: observations ``[count, size]``, float32
-    :param actions: numbers that the policy writes
     :param options: the compiler's
+    :param name: of the library, without suffix; empty: the file's
     :raises UnsupportedError: if there is no compiler, or it fails
     """
-    loop, library = source.with_name("loop.c"), source.with_suffix(".so")
+    loop, library = source.with_name("loop.c"), source.with_name(f"{name or source.stem}.so")
     loop.write_text(LOOP)
     command = [*compiler(), *options, "-D_POSIX_C_SOURCE=199309L", "-shared", "-fPIC"]
     command += [str(source), str(loop), "-o", str(library), "-lm"]
     done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode:
         raise UnsupportedError(f"{command[0]} cannot compile the loop: {done.stderr.strip()}")
-    seconds = ctypes.CDLL(str(library)).seconds
+    return ctypes.CDLL(str(library))
+
+
+def c_burst(library: ctypes.CDLL, rows: np.ndarray, actions: int) -> Burst:
+    """Make a burst of actions called from C.
+
+    :param library: of :func:`with_loop`
+    :param rows: observations ``[count, size]``, float32, taken in turn
+    :param actions: numbers that the policy writes
+    """
+    seconds = library.seconds
     seconds.restype = ctypes.c_double
     pointer = ctypes.POINTER(ctypes.c_float)
     action = np.empty(actions, np.float32)
@@ -125,15 +142,18 @@ def c_burst(
     return burst
 
 
-def medians(*bursts: Burst) -> list[float]:
-    """Measure the seconds of an action of each in turn, after a burst that sets the size of all."""
+def measure(bursts: Sequence[Burst], rounds: int = ROUNDS) -> list[list[float]]:
+    """Measure the seconds of an action of each in turn, after a burst that sets the size of all.
+
+    :return: for each burst, a time for each round
+    """
     counts = []
     for burst in bursts:
         burst(20)
         counts.append(max(3, round(BURST / (burst(20) / 20))))
     times: list[list[float]] = [[] for _ in bursts]
-    for _ in range(ROUNDS):
+    for _ in range(rounds):
         for burst, count, found in zip(bursts, counts, times, strict=True):
             burst(3)  # what the one before has pushed out of the cache
             found.append(burst(count) / count)
-    return list(map(median, times))
+    return times

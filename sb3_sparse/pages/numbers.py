@@ -36,5 +36,10 @@ def shorten(values: Sequence[float]) -> list[str]:
     return texts
 
 
+def counted(number: int, thing: str) -> str:
+    """Write how many there are of a thing, e.g. ``"1 seed"`` and ``"1,000 seeds"``."""
+    return f"{number:,} {thing}" + ("s" if number != 1 else "")
+
+
 def _trimmed(text: str) -> str:
     return text.rstrip("0").rstrip(".") if "." in text else text

@@ -12,45 +12,10 @@ from typing import Any
 import numpy as np
 
 from sb3_sparse.files import write_csv, written_whole
-from sb3_sparse.pages.backend import (
-    Axes,
-    Figure,
-    Line2D,
-    MaxNLocator,
-    Patch,
-    PercentFormatter,
-    matplotlib,
-)
-from sb3_sparse.pages.lines import (
-    BAND,
-    RUN,
-    SEED,
-    THIN,
-    Ends,
-    curve,
-    heights_of,
-    line,
-    logarithmic,
-    points,
-)
+from sb3_sparse.pages.backend import Axes, Figure, Line2D, Patch, matplotlib
+from sb3_sparse.pages.lines import BAND, RUN, SEED, THIN, Ends, heights_of, line
 from sb3_sparse.pages.look import Look
 
-__all__ = [
-    "Axes",
-    "Drawing",
-    "Figure",
-    "MaxNLocator",
-    "PercentFormatter",
-    "Sheet",
-    "curve",
-    "line",
-    "logarithmic",
-    "points",
-    "save",
-    "save_png",
-    "styled",
-    "svg_of",
-]
 WIDTH, HEIGHT, COLUMNS = 3.4, 2.7, 3
 NARROWEST = 4.6
 SPARE = 0.5
@@ -154,7 +119,7 @@ class Sheet:
         look: Look,
         label: str,
     ) -> None:
-        """Draw a line as :func:`line` does, and add its rows.
+        """Draw a line as :func:`sb3_sparse.pages.lines.line` does, and add its rows.
 
         :param place: what begins each of the rows
         :param ends: mean, and lower and upper end of the interval, each of the shape of ``x``

@@ -2,9 +2,10 @@
 
 from sb3_sparse.report.data import LeftOut, RunData
 from sb3_sparse.report.figures import FIGURES
+from sb3_sparse.report.findings import FINDINGS
 from sb3_sparse.report.reading import read_runs
 from sb3_sparse.report.results import Results
-from sb3_sparse.report.verdicts import FINDINGS, Verdict, judge
+from sb3_sparse.report.verdicts import Verdict, judge
 from sb3_sparse.report.write import write_report
 
 __all__ = [

@@ -6,14 +6,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from sb3_sparse.pages import html
+from sb3_sparse.pages.numbers import counted
 from sb3_sparse.pages.table import Cell, Table
 from sb3_sparse.report.data import LeftOut
 from sb3_sparse.report.figures import FIGURES
+from sb3_sparse.report.findings import FINDINGS
 from sb3_sparse.report.methods import percent
 from sb3_sparse.report.results import Results
-from sb3_sparse.report.summary import scores, sentences
+from sb3_sparse.report.summary import scores, sentences, verdict_in_words
 from sb3_sparse.report.tables import findings_table
-from sb3_sparse.report.verdicts import FINDINGS, LEAST_SEEDS, Verdict
+from sb3_sparse.report.verdicts import LEAST_SEEDS, Verdict
 
 CSV_FILES = ("cells.csv", "runs.csv", "verdicts.csv")
 PAPER = "The State of Sparse Training in Deep Reinforcement Learning (arXiv:2206.10369)"
@@ -99,7 +101,7 @@ def render(content: Content) -> str:
     """Return the page's HTML: what was found, what shows it, and what it is made of."""
     drawn = [shown for shown in content.figures if shown.svg is not None]
     hero, more = drawn[:1], [shown for shown in content.figures if shown not in drawn[:1]]
-    lead = [html.lead(text) for text in sentences(content.results)]
+    lead = map(html.lead, [*_verdict_of(content), *sentences(content.results)])
     sections = [
         *_scores(content.results, hero),
         _findings(content),
@@ -113,19 +115,25 @@ def render(content: Content) -> str:
     return html.page(content.title, [*lead, html.paragraph(_counts(content))], sections)
 
 
+def _verdict_of(content: Content) -> list[str]:
+    """Return the outcome of a study that tests a single finding, which is what it is about."""
+    single = len({one.finding.key for one in content.verdicts}) == 1
+    return list(map(verdict_in_words, content.verdicts)) if single else []
+
+
 def _counts(content: Content) -> str:
     results = content.results
     runs = results.trained
-    counted = len(results.runs) - len(runs)
+    untrained = len(results.runs) - len(runs)
     steps = sum(run.steps for run in runs)
-    also = f", and {counted} only counted" if counted else ""
+    also = f", and {untrained} only counted" if untrained else ""
     without = {
         "diverged": len(content.diverged),
         "left out": len(content.others),
         "still to be trained": len(content.pending),
     }
     missing = "".join(f"; {count} {what}" for what, count in without.items() if count)
-    finished = f"{len(runs)} finished run{'s' * (len(runs) != 1)}"
+    finished = counted(len(runs), "finished run")
     return f"{finished}{also}, {steps:,} environment steps{missing}."
 
 
@@ -182,7 +190,7 @@ def _in_percent(table: Table) -> Table:
 def _shortened(table: Table, *keep: str) -> list[str]:
     """Make a table without columns of one value, and a sentence of what these hold."""
     shorter, same = table.varying(*keep)
-    texts = [f"{name} {value}" for name, value in same.items() if value != ""]
+    texts = [f"{name} {value}" for name, value in same.items()]
     return [html.table(shorter), *([html.paragraph(f"All: {', '.join(texts)}.")] if texts else ())]
 
 
@@ -263,7 +271,7 @@ def _pending(content: Content) -> list[html.Section]:
         return []
     parts = []
     if content.pending:
-        summary = f"{len(content.pending)} runs are still to be trained"
+        summary = f"Still to be trained: {counted(len(content.pending), 'run')}"
         parts.append(html.folded(summary, html.listing(content.pending)))
     if content.command:
         parts.append(html.code(content.command))

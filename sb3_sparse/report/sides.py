@@ -37,6 +37,12 @@ class Sides:
     why: str = ""
     runs: tuple[RunData, ...] = ()
 
+    def with_seeds(self, least: int) -> Sides:
+        """Return the sides over the strata that have as many seeds of both."""
+        fit = [name for name in self.x if min(len(self.x[name]), len(self.y[name])) >= least]
+        x, y = ({name: side[name] for name in fit} for side in (self.x, self.y))
+        return Sides(x, y, self.why, self.runs)
+
 
 def sparse_and_equal(results: Results, family: str) -> Sides:
     """Compare pruning, SET and RigL with the dense network of as many parameters."""

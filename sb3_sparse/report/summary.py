@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sb3_sparse.pages.numbers import short, shorten
+from sb3_sparse.pages.numbers import counted, short, shorten
 from sb3_sparse.pages.table import Cell, Table
 from sb3_sparse.report.data import RunData
 from sb3_sparse.report.methods import DENSE, EQUAL, in_order, name_of, percent
@@ -14,6 +14,7 @@ from sb3_sparse.report.normalisation import possible_returns
 from sb3_sparse.report.results import Results, grouped
 from sb3_sparse.report.statistics import Estimate, mean
 from sb3_sparse.report.values import order_of, shown_value
+from sb3_sparse.report.verdicts import Verdict
 
 LEAST = 3
 """Seeds below which a mean has no interval here: that of two is mostly beyond possible returns."""
@@ -69,8 +70,17 @@ def _sentence(results: Results, family: str, env_id: str, level: float) -> str:
     ]
     if len(methods) > 1:
         texts[0] += f", the highest mean of {len(methods)} sparse methods"
-    end = f"; {_seeds(seeds.pop())}" if len(seeds) == 1 else ""
+    end = f"; {counted(seeds.pop(), 'seed')}" if len(seeds) == 1 else ""
     return f"{_task(results, family, env_id)} at {percent(level)}: {'; '.join(texts)}{end}."
+
+
+def verdict_in_words(verdict: Verdict) -> str:
+    """Say in a sentence what became of a finding."""
+    text = f"{verdict.finding.text.removesuffix('.')}: {verdict.verdict}"
+    if not verdict.shown:
+        return f"{text} ({verdict.remark})."
+    seeds = counted(verdict.seeds, "seed")
+    return f"{text}, {verdict.shown} of the {verdict.finding.unit}; {seeds}."
 
 
 def scores(results: Results) -> list[Scores]:
@@ -84,7 +94,8 @@ def scores(results: Results) -> list[Scores]:
     return found
 
 
-Row = tuple[str, float]
+Row = tuple[str, float | None]
+"""A method, and its sparsity unless that is the column."""
 Entries = dict[Row, dict[Any, list[RunData]]]
 
 
@@ -95,7 +106,7 @@ def _by_level(results: Results, family: str, env_id: str) -> Entries:
         for level in [0.0] if label == DENSE else results.levels(family):
             runs = results.cell(family, env_id, label, level)
             if runs:
-                found.setdefault((label, -1.0), {})[level] = runs
+                found.setdefault((label, None), {})[level] = runs
     return found
 
 
@@ -121,7 +132,7 @@ def _cell(run: RunData) -> tuple[str, str, str, float]:
 
 
 def _table(title: str, env_id: str, cells: Entries, varies: str | None) -> Scores:
-    by_level = all(level < 0 for _, level in cells)
+    by_level = all(level is None for _, level in cells)
     columns = sorted({at for row in cells.values() for at in row}, key=order_of)
     means = {
         (row, at): score_of(runs, env_id) for row, by in cells.items() for at, runs in by.items()
@@ -138,23 +149,16 @@ def _table(title: str, env_id: str, cells: Entries, varies: str | None) -> Score
             more = "" if len(seeds) == 1 else _of(one)
             texts[row, at] = f"{_interval(one, digits)}{more}"
     order = in_order({label for label, _ in cells})
+    entries = {place: Cell(one.value, texts[place], place in best) for place, one in means.items()}
     rows = [
-        [_named(label, level)]
-        + [
-            Cell(
-                means[(label, level), at].value,
-                texts[(label, level), at],
-                ((label, level), at) in best,
-            )
-            if ((label, level), at) in means
-            else None
-            for at in columns
-        ]
-        for label, level in sorted(cells, key=lambda row: (order.index(row[0]), row[1]))
+        [_named(*row), *(entries.get((row, at)) for at in columns)]
+        for row in sorted(cells, key=lambda row: (order.index(row[0]), row[1] or 0.0))
     ]
     heads = [percent(at) if by_level else str(at) for at in columns]
     what = "by sparsity" if by_level else f"by {varies}"
-    common = f" over {_seeds(seeds.pop())}" if len(seeds) == 1 else ", with the number of seeds"
+    common = (
+        f" over {counted(seeds.pop(), 'seed')}" if len(seeds) == 1 else ", with the number of seeds"
+    )
     bold = (
         "; the highest of a column is bold, whether or not it can be told from others"
         if best
@@ -187,12 +191,10 @@ def _of(one: Estimate) -> str:
     return f" ({one.seeds})"
 
 
-def _seeds(count: int) -> str:
-    return f"{count} seed" if count == 1 else f"{count} seeds"
-
-
-def _named(label: str, level: float) -> str:
-    return name_of(label) if level < 0 or label == DENSE else f"{name_of(label)}, {percent(level)}"
+def _named(label: str, level: float | None) -> str:
+    if level is None or label == DENSE:
+        return name_of(label)
+    return f"{name_of(label)}, {percent(level)}"
 
 
 def _task(results: Results, family: str, env_id: str) -> str:

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from sb3_sparse.pages.numbers import short
 from sb3_sparse.pages.table import Cell, Table
 from sb3_sparse.report.data import RunData
+from sb3_sparse.report.findings import CONTRADICTED, SUPPORTED, UNDECIDED
 from sb3_sparse.report.methods import DENSE, EQUAL, name_of
 from sb3_sparse.report.results import Results, cell_of, grouped
 from sb3_sparse.report.statistics import LEAST, iqm, iqm_estimates
-from sb3_sparse.report.verdicts import CONTRADICTED, SUPPORTED, UNDECIDED, Verdict
+from sb3_sparse.report.verdicts import Verdict
 
 MARKS = {SUPPORTED: "good", CONTRADICTED: "bad", UNDECIDED: "open"}
 
@@ -84,17 +84,14 @@ def findings_table(verdicts: Sequence[Verdict]) -> Table:
     heads += ["seeds", "comparisons", "seeds needed", "algorithm and tasks", "remark"]
     rows: list[list[Any]] = [
         [v.finding.text, v.verdict, _effect(v), v.holds or None, v.finding.unit, v.seeds or None]
-        + [v.strata or None, v.needed, v.family, v.remark or None]
+        + [v.comparisons or None, v.needed, v.family, v.remark or None]
         for v in verdicts
     ]
     return Table(heads, rows, marks=MARKS)
 
 
 def _effect(verdict: Verdict) -> Cell | None:
-    if verdict.effect is None or verdict.low is None or verdict.high is None:
-        return None
-    value, low, high = map(short, (verdict.effect, verdict.low, verdict.high))
-    return Cell(verdict.effect, f"{value} [{low}; {high}]")
+    return None if verdict.effect is None else Cell(verdict.effect, verdict.shown)
 
 
 def verdicts_table(verdicts: Sequence[Verdict]) -> Table:
@@ -103,7 +100,7 @@ def verdicts_table(verdicts: Sequence[Verdict]) -> Table:
     heads += ["seeds", "comparisons", "seeds needed", "algorithm and tasks", "remark"]
     rows: list[list[Any]] = [
         [v.finding.text, v.verdict, v.effect, v.low, v.high, v.holds, v.finding.unit]
-        + [v.seeds, v.strata, v.needed, v.family or None, v.remark]
+        + [v.seeds, v.comparisons, v.needed, v.family or None, v.remark]
         for v in verdicts
     ]
     return Table(heads, rows, marks=MARKS)

@@ -1,124 +1,20 @@
-"""The paper's findings tested on runs, each by a written rule."""
+"""Verdicts of runs on the findings of the paper."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
-from sb3_sparse.errors import check_choice
 from sb3_sparse.pages.numbers import short
-from sb3_sparse.report.data import Array
+from sb3_sparse.report.findings import FINDINGS, UNDECIDED, Finding, Region, check_findings
 from sb3_sparse.report.results import Results
-from sb3_sparse.report.sides import (
-    Sides,
-    by_distribution,
-    by_noise,
-    by_share,
-    by_snr,
-    by_weight_decay,
-    rigl_and_set,
-    sparse_and_dense,
-    sparse_and_equal,
-)
-from sb3_sparse.report.statistics import Estimate, difference, iqm, rectangle, seeds_for
+from sb3_sparse.report.sides import Sides
+from sb3_sparse.report.statistics import difference, rectangle
 
-SUPPORTED, CONTRADICTED, UNDECIDED = "supported", "contradicted", "not enough data"
 LEAST_SEEDS = 3
-NO_LOSS, SAME = 0.05, 0.1
+NOTHING = 0.005
 NO_MARGIN = "the other side's IQM is not above 0, so no margin can be a share of it"
-
-
-@dataclass(frozen=True)
-class Region:
-    """The effects for which a finding holds.
-
-    A finding is supported if the effect's interval lies inside, contradicted if it lies outside.
-
-    :param text: the same in words
-    :param low: lower end
-    :param high: upper end
-    :param relative: whether the ends are shares of the other side's statistic
-    """
-
-    text: str
-    low: float = -math.inf
-    high: float = math.inf
-    relative: bool = False
-
-    def scaled(self, reference: float) -> Region | None:
-        """Return the region in the effect's unit.
-
-        :param reference: the other side's statistic
-        :return: None if the ends are shares of a statistic that is not above 0
-        """
-        if not self.relative:
-            return self
-        if reference <= 0:
-            return None
-        return Region(self.text, self.low * reference, self.high * reference)
-
-    def verdict(self, effect: Estimate) -> str:
-        """Return the verdict on an effect, of a region in its unit."""
-        if effect.low > self.low and effect.high < self.high:
-            return SUPPORTED
-        outside = effect.high < self.low or effect.low > self.high
-        return CONTRADICTED if outside else UNDECIDED
-
-    def needed(self, effect: Estimate) -> int | None:
-        """Return the seeds that would decide an open effect if it stays as it is.
-
-        :param effect: an effect in the region's unit
-        :return: None for more than 1,000
-        """
-        below, above = effect.value - effect.low, effect.high - effect.value
-        if self.low < effect.value < self.high:
-            ways = [(effect.value - self.low, below), (self.high - effect.value, above)]
-        elif effect.value <= self.low:
-            ways = [(self.low - effect.value, above)]
-        else:
-            ways = [(effect.value - self.high, below)]
-        share = min(room / reach for room, reach in ways if reach > 0)
-        return seeds_for(effect, share) if share > 0 else None
-
-
-GREATER = Region("supported if the interval lies above 0, contradicted if it lies below", low=0.0)
-LESS = Region("supported if the interval lies below 0, contradicted if it lies above", high=0.0)
-NOT_LESS = Region(
-    f"supported if the interval lies above -{NO_LOSS:.0%} of the dense IQM, contradicted if it "
-    "lies below that",
-    low=-NO_LOSS,
-    relative=True,
-)
-CLOSE = Region(
-    f"supported if the interval lies within +-{SAME:.0%} of SET's IQM, contradicted if it lies "
-    "outside",
-    -SAME,
-    SAME,
-    relative=True,
-)
-
-
-@dataclass(frozen=True)
-class Finding:
-    """A finding of the paper, and how it is tested.
-
-    :param key: its name
-    :param text: the finding
-    :param rule: what is compared
-    :param sides: returns the scores of both sides by comparison
-    :param region: the effects for which it holds
-    :param statistic: the difference of this statistic is the effect
-    :param unit: unit of the effect
-    """
-
-    key: str
-    text: str
-    rule: str
-    sides: Callable[[Results, str], Sides]
-    region: Region
-    statistic: Callable[[Array], float]
-    unit: str
 
 
 @dataclass(frozen=True)
@@ -132,7 +28,7 @@ class Verdict:
     :param low: lower end of its 95 % interval
     :param high: upper end
     :param seeds: runs of each comparison, on the scarcer side
-    :param strata: number of comparisons
+    :param comparisons: their number
     :param needed: seeds that would decide an open verdict if the effect stays as it is; None for
         more than 1,000, and where there is no effect
     :param region: the effects for which the finding holds, in the effect's unit
@@ -153,10 +49,24 @@ class Verdict:
     low: float | None = None
     high: float | None = None
     seeds: int = 0
-    strata: int = 0
+    comparisons: int = 0
     needed: int | None = None
     region: Region | None = None
     remark: str = ""
+
+    @property
+    def shown(self) -> str:
+        """The effect with its interval, e.g. ``"+0.22 [-0.10; +0.57]"``; empty without an effect.
+
+        An end that two decimals would round to nothing shows on which side of it it lies.
+        """
+        if self.effect is None or self.low is None or self.high is None:
+            return ""
+        value, low, high = (
+            f"{one:+.1g}" if 0 < abs(one) < NOTHING else f"{one:+.2f}"
+            for one in (self.effect, self.low, self.high)
+        )
+        return f"{value} [{low}; {high}]"
 
     @property
     def holds(self) -> str:
@@ -174,97 +84,36 @@ class Verdict:
         return bool(self.family)
 
 
-def _average(scores: Array) -> float:
-    return float(scores.mean())
-
-
-IQM_UNIT, MEAN_UNIT = "normalised IQM", "normalised mean"
-FINDINGS = (
-    Finding(
-        "equal-parameters",
-        "Sparse networks beat dense ones with as many parameters.",
-        "Pruning, SET and RigL (their mean) minus the parameter-equivalent dense network, at all "
-        "sparsities from 50 % on; each environment and sparsity is a comparison",
-        sparse_and_equal, GREATER, iqm, IQM_UNIT,
-    ),
-    Finding(
-        "no-loss",
-        "80 to 90 % sparse networks lose nothing against the dense one of full size.",
-        "Pruning, SET and RigL at 80 to 90 % (mean over methods and sparsities) minus the dense "
-        "network of full size; each environment is a comparison",
-        sparse_and_dense, NOT_LESS, iqm, IQM_UNIT,
-    ),
-    Finding(
-        "rigl-set",
-        "RigL's gradients gain little over SET's random growth.",
-        "RigL minus SET at 50 to 95 %; each environment and sparsity is a comparison",
-        rigl_and_set, CLOSE, iqm, IQM_UNIT,
-    ),
-    Finding(
-        "erk",
-        "ERK is better than uniform sparsity.",
-        "ERK minus uniform, all else the same; each environment, method and sparsity is a "
-        "comparison",
-        by_distribution, GREATER, _average, MEAN_UNIT,
-    ),
-    Finding(
-        "critic",
-        "The critic needs the parameters more than the actor.",
-        "Runs whose actor has 20 % of the connections or less minus runs whose critic has, all "
-        "else the same; each environment, method and sparsity is a comparison",
-        by_share, GREATER, _average, MEAN_UNIT,
-    ),
-    Finding(
-        "weight-decay",
-        "A small weight decay helps.",
-        "Weight decay above 0 and up to 1e-4 minus none, all else the same; each environment, "
-        "method and sparsity is a comparison",
-        by_weight_decay, GREATER, _average, MEAN_UNIT,
-    ),
-    Finding(
-        "snr",
-        "The gradients' signal-to-noise ratio falls with sparsity.",
-        "Mean natural logarithm of the SNR over training at the highest sparsity minus that at the "
-        "lowest (dense is 0 %); each environment and network is a comparison",
-        by_snr, LESS, _average, "log SNR",
-    ),
-    Finding(
-        "noise",
-        "Sparse networks bear observation noise better than dense ones with as many parameters.",
-        "What the upper half of the strengths of noise costs (mean normalised return minus that "
-        "without noise): sparse minus parameter-equivalent dense; each environment and sparsity "
-        "is a comparison",
-        by_noise, GREATER, _average, MEAN_UNIT,
-    ),
-)  # fmt: skip
-
-
 def judge(results: Results) -> list[Verdict]:
     """Judge each finding by each family of runs that has data on it.
 
     A finding without data has one verdict, "not enough data", that says what is missing.
 
+    :param results: the runs, and the findings to judge
     :raises ConfigError: for an unknown key in the results' findings
     """
-    asked = [finding.key for finding in FINDINGS] if results.findings is None else results.findings
-    for key in asked:
-        check_choice("finding", key, [finding.key for finding in FINDINGS])
+    return list(_judged(results))
+
+
+@lru_cache(maxsize=1)  # a page judges, and so does its figure of findings: a bootstrap each
+def _judged(results: Results) -> tuple[Verdict, ...]:
+    asked = results.findings
+    check_findings(asked or ())
     found = []
-    for finding in (one for one in FINDINGS if one.key in asked):
+    for finding in (one for one in FINDINGS if asked is None or one.key in asked):
         given = [(family, finding.sides(results, family)) for family in results.families()]
         known = [(family, sides) for family, sides in given if sides.x]
         if not known:
             why = "; ".join(dict.fromkeys(sides.why for _, sides in given)) or "no trained run"
             found.append(Verdict(finding, "", UNDECIDED, remark=why))
         found += [_verdict(finding, family, sides) for family, sides in known]
-    return found
+    return tuple(found)
 
 
 def _verdict(finding: Finding, family: str, sides: Sides) -> Verdict:
-    fit = [name for name in sides.x if min(len(sides.x[name]), len(sides.y[name])) >= LEAST_SEEDS]
-    x = rectangle({name: sides.x[name] for name in fit}, LEAST_SEEDS)
-    y = rectangle({name: sides.y[name] for name in fit}, LEAST_SEEDS)
-    few = [name for name in sides.x if name not in fit]
+    fit = sides.with_seeds(LEAST_SEEDS)
+    x, y = rectangle(fit.x, LEAST_SEEDS), rectangle(fit.y, LEAST_SEEDS)
+    few = [name for name in sides.x if name not in fit.x]
     remark = f"fewer than {LEAST_SEEDS} seeds of both sides: {', '.join(few)}" if few else ""
     if x is None or y is None:
         return Verdict(finding, family, UNDECIDED, remark=remark)

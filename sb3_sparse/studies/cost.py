@@ -12,7 +12,7 @@ from statistics import median
 from typing import Any
 
 from sb3_sparse.errors import SparsityError
-from sb3_sparse.pages.numbers import short
+from sb3_sparse.pages.numbers import counted, short
 from sb3_sparse.studies.cell import DIGITS, RUNS, Cell
 from sb3_sparse.studies.status import CellState, CellStatus
 from sb3_sparse.zoo.archive import Lines
@@ -60,7 +60,7 @@ class Cost:
         hours = f"{number} core {'hour' if number == '1' else 'hours'}"
         if self.unknown:
             hours = f"more than {hours}" if self.seconds else "core hours unknown"
-        return f"{self.runs} {'run' if self.runs == 1 else 'runs'}, {hours}"
+        return f"{counted(self.runs, 'run')}, {hours}"
 
     def remarks(self) -> list[str]:
         """Return how many are estimated from unlike runs, and what is unknown."""

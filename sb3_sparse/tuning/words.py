@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from sb3_sparse.intervals import mean_interval
 from sb3_sparse.pages.names import METHODS
-from sb3_sparse.pages.numbers import short
+from sb3_sparse.pages.numbers import counted, short
 from sb3_sparse.tuning.backend import BaseDistribution, FrozenTrial
 from sb3_sparse.tuning.definition import Definition
 from sb3_sparse.tuning.objective import VALUES
@@ -107,11 +107,6 @@ def facts(search: Search) -> list[str]:
     texts += [f"Trial {one.number} diverged: {one.user_attrs['diverged']}." for one in diverged]
     texts += [f"Trial {one.number} failed: {status.why_failed(one)}." for one in status.failed]
     return texts
-
-
-def counted(number: int, thing: str) -> str:
-    """Write how many there are of a thing."""
-    return f"{number:,} {thing}" + ("s" if number != 1 else "")
 
 
 def _is_as_configured(definition: Definition, trial: FrozenTrial) -> bool:

@@ -182,7 +182,7 @@ KEYS = {"equal-parameters": 8, "no-loss": 2, "rigl-set": 6, "noise": 4}
 def test_a_verdict_is_that_of_plain_numpy(key, judged):
     one = judged[key]
     x, y = sides_of(key)
-    assert x.shape == y.shape == (one.seeds, one.strata) == (len(SEEDS), KEYS[key])
+    assert x.shape == y.shape == (one.seeds, one.comparisons) == (len(SEEDS), KEYS[key])
     effect = statistic(key, x) - statistic(key, y)
     assert one.effect == pytest.approx(effect, abs=1e-12)
 

@@ -148,6 +148,23 @@ def test_what_cannot_be_drawn_again_stays_and_the_page_says_so(name, lost, folde
     assert f"figures/{name}.svg" in page
 
 
+def test_a_study_of_one_finding_opens_with_its_verdict(folders, tmp_path):
+    for seed in range(3):
+        folders.add("rigl", 0.9, seed, 400.0 + seed, snr={"snr/q_net": 0.1})
+        folders.add("dense", None, seed, 300.0 + seed, snr={"snr/q_net": 0.2})
+    one = write_report(folders.made, tmp_path / "1", title="T", figures=["snr"], findings=["snr"])
+    leads = re.findall(r'<p class="lead">(.*?)</p>', one.read_text())
+    assert leads[0] == (
+        "The gradients&#x27; signal-to-noise ratio falls with sparsity: supported, "
+        "-0.69 [-0.69; -0.69] of the log SNR; 3 seeds."
+    )
+    assert leads[1].startswith("CartPole-v1 at 90 %: RigL ")
+    both = write_report(
+        folders.made, tmp_path / "2", title="T", figures=["snr"], findings=["snr", "no-loss"]
+    )
+    assert re.findall(r'<p class="lead">(.*?)</p>', both.read_text()) == leads[1:]
+
+
 def test_runs_that_diverged_have_a_section_of_their_own(folders, tmp_path):
     for seed, status in enumerate(["finished", "diverged", "running"]):
         folders.add("rigl", 0.9, seed, status=status)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from sb3_sparse.errors import ConfigError
-from sb3_sparse.report import FINDINGS, Results, judge, read_runs
+from sb3_sparse.report import FINDINGS, Results, Verdict, judge, read_runs
+from sb3_sparse.report.findings import GREATER as GREATER_REGION
 from sb3_sparse.report.statistics import Estimate
-from sb3_sparse.report.verdicts import GREATER as GREATER_REGION
 
 SUPPORTED, CONTRADICTED, UNDECIDED = "supported", "contradicted", "not enough data"
 
@@ -158,7 +158,7 @@ def test_tasks_are_strata(folders):
         seeds(folders, 3, score, env_id=env_id)
         seeds(folders, 3, score - 60, env_id=env_id, **EQUAL)
     found = verdict(folders, "equal-parameters")
-    assert (found.verdict, found.strata, found.seeds) == (SUPPORTED, 2, 3)
+    assert (found.verdict, found.comparisons, found.seeds) == (SUPPORTED, 2, 3)
 
 
 def test_an_open_verdict_tells_how_many_seeds_would_decide_it(folders):
@@ -226,3 +226,9 @@ def test_only_the_findings_that_are_asked_for_are_judged(folders):
     assert [one.finding.key for one in found] == ["erk", "noise"]
     with pytest.raises(ConfigError, match=r"unknown finding 'nois' \(did you mean 'noise'"):
         judge(Results(tuple(runs), findings=("nois",)))
+
+
+def test_an_effect_shows_on_which_side_of_nothing_its_ends_lie():
+    shown = Verdict(FINDINGS[0], "DQN", UNDECIDED, -0.224, -0.458, 0.00004).shown
+    assert shown == "-0.22 [-0.46; +4e-05]"
+    assert Verdict(FINDINGS[0], "", UNDECIDED).shown == ""

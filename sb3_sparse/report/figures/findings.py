@@ -9,16 +9,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sb3_sparse.errors import check_choice
 from sb3_sparse.pages.backend import Axes, MaxNLocator
 from sb3_sparse.pages.numbers import short
 from sb3_sparse.pages.plot import GREY, Drawing, Sheet
 from sb3_sparse.report.figures.base import figure
+from sb3_sparse.report.findings import FINDINGS, check_findings
 from sb3_sparse.report.methods import name_of
 from sb3_sparse.report.results import NotEnoughData, Results
-from sb3_sparse.report.sides import Sides
 from sb3_sparse.report.statistics import Estimate, mean_difference
-from sb3_sparse.report.verdicts import FINDINGS, LEAST_SEEDS, Verdict, judge
+from sb3_sparse.report.verdicts import LEAST_SEEDS, Verdict, judge
 
 HEADS = ("finding", "algorithm and tasks", "compared", "effect", "low", "high", "unit", "seeds",
          "seeds of the other side", "verdict")  # fmt: skip
@@ -72,12 +71,10 @@ def forest(
     :raises ConfigError: for an unknown key
     :raises NotEnoughData: if there are data on none of them
     """
-    known = [finding.key for finding in FINDINGS]
-    for key in keys or ():
-        check_choice("finding", key, known)
+    check_findings(keys or ())
+    asked = [finding.key for finding in FINDINGS] if keys is None else keys
     given = {
-        key: [one for one in verdicts if one.finding.key == key and one.family]
-        for key in (known if keys is None else keys)
+        key: [one for one in verdicts if one.finding.key == key and one.has_data] for key in asked
     }
     shown = [found for found in given.values() if found]
     if not shown:
@@ -104,7 +101,8 @@ def _lines(results: Results, verdicts: Sequence[Verdict]) -> list[list[_Line]]:
         block = []
         if verdict.effect is not None and verdict.low is not None and verdict.high is not None:
             pooled = Estimate(verdict.effect, verdict.low, verdict.high, verdict.seeds)
-            counts = _fewest(sides)
+            fit = sides.with_seeds(LEAST_SEEDS)
+            counts = (min(map(len, fit.x.values())), min(map(len, fit.y.values())))
             block.append(_Line(verdict.family, pooled, counts, verdict.verdict))
         for name in sides.x:
             x, y = sides.x[name], sides.y[name]
@@ -190,18 +188,6 @@ def _text(number: float) -> str:
     """Write a number with two decimals, so that those below each other compare."""
     text = f"{number:.2f}" if abs(number) < 10 else short(number)
     return text.replace("-0.00", "0.00").replace("-", "\N{MINUS SIGN}")
-
-
-def _counting(sides: Sides) -> tuple[dict[str, list[float]], dict[str, list[float]]]:
-    """Return the cells compared that have enough seeds of both sides."""
-    fit = [name for name in sides.x if min(len(sides.x[name]), len(sides.y[name])) >= LEAST_SEEDS]
-    return {name: sides.x[name] for name in fit}, {name: sides.y[name] for name in fit}
-
-
-def _fewest(sides: Sides) -> tuple[int, int]:
-    """Return the seeds that each side's pooled cells have, which is the fewest of any."""
-    x, y = _counting(sides)
-    return min(map(len, x.values())), min(map(len, y.values()))
 
 
 def _shade(one: Axes, verdict: Verdict, top: int, rows: int) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 from sb3_sparse.intervals import mean_interval
 from sb3_sparse.pages.backend import Axes
 from sb3_sparse.pages.lines import ANY, Within, curve, points
+from sb3_sparse.pages.numbers import counted
 from sb3_sparse.pages.plot import TEXT, Drawing, Sheet
 from sb3_sparse.report.data import Array
 from sb3_sparse.report.methods import look_of
@@ -144,7 +145,7 @@ class Grid(Sheet):
         rows, columns = len(self.lines_of), len(self.names)
         if self.counts:
             low, high = min(self.counts), max(self.counts)
-            seeds = f"{low} to {high} seeds" if low < high else _plural(high, "seed")
+            seeds = f"{low} to {high} seeds" if low < high else counted(high, "seed")
             self.title = ", ".join(text for text in (self.title, seeds) if text)
         if self.flowing:
             for one, row in zip(self.axes, self.lines_of, strict=True):
@@ -190,7 +191,3 @@ def _titles(places: Sequence[Place]) -> tuple[str, dict[Place, str]]:
 def _broken(name: str) -> str:
     """Break a long name at its comma or colon."""
     return name.replace(", ", ",\n").replace(": ", ":\n")
-
-
-def _plural(count: int, what: str) -> str:
-    return f"{count} {what}" if count == 1 else f"{count} {what}s"

@@ -8,7 +8,8 @@ import numpy as np
 
 from sb3_sparse.errors import SparsityError
 from sb3_sparse.loading.zips import look_into
-from sb3_sparse.pages.plot import Axes, Drawing, MaxNLocator, Sheet
+from sb3_sparse.pages.backend import Axes, MaxNLocator
+from sb3_sparse.pages.plot import Drawing, Sheet
 from sb3_sparse.policies.compiled import plain_names
 from sb3_sparse.report.data import Array, RunData
 from sb3_sparse.report.figures.base import figure

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from sb3_sparse.pages.plot import Axes, Figure
+from sb3_sparse.pages.backend import Axes, Figure
 
 BEST, GREY, MEAN = "#362682", "#9a9a9a", "#222222"
 WIDTH, HEIGHT = 4.8, 3.0  # inches; this width needs no scrolling on a phone

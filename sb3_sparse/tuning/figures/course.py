@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sb3_sparse.pages.plot import Axes, MaxNLocator
+from sb3_sparse.pages.backend import Axes, MaxNLocator
 from sb3_sparse.tuning.backend import FrozenTrial, TrialState
 from sb3_sparse.tuning.evaluations import curve_of
 from sb3_sparse.tuning.figures.base import BEST, GREY, Picture, panels

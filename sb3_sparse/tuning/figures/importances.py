@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 
-from sb3_sparse.pages.plot import PercentFormatter
+from sb3_sparse.pages.backend import PercentFormatter
 from sb3_sparse.tuning.backend import optuna
 from sb3_sparse.tuning.figures.base import BEST, Picture, panels
 from sb3_sparse.tuning.search import Search

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from sb3_sparse.intervals import Array
+from sb3_sparse.pages.backend import Axes, MaxNLocator
 from sb3_sparse.pages.numbers import shorten
-from sb3_sparse.pages.plot import Axes, MaxNLocator
 from sb3_sparse.sparsity.numeric import is_number
 from sb3_sparse.tuning.backend import BaseDistribution, FrozenTrial
 from sb3_sparse.tuning.figures.base import BEST, GREY, MEAN, Picture, panels
