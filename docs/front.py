@@ -30,8 +30,7 @@ def front(results: Results) -> Drawing:
         sheet = Sheet((), 2, 2, 2.9, width=4.4)
         _speed(sheet.axes[0])
         _returns_by_size(sheet.axes[1], results)
-        sheet.figure.legend(loc="outside lower right", ncols=5)
-        return Drawing(sheet.figure, (), ())
+        return sheet.drawing()
 
 
 def _speed(one: Axes) -> None:

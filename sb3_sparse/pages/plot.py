@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from sb3_sparse.files import write_csv, written_whole
-from sb3_sparse.pages.backend import Axes, Figure, Line2D, Patch, matplotlib
+from sb3_sparse.pages.backend import Axes, Figure, Layout, Line2D, Patch, matplotlib
 from sb3_sparse.pages.lines import BAND, RUN, SEED, THIN, Ends, heights_of, line
 from sb3_sparse.pages.look import Look
 
@@ -101,7 +101,7 @@ class Sheet:
         self.columns = min(columns, count)
         rows = -(-count // self.columns)
         size = (max(width * self.columns, NARROWEST), height * rows + LINE * bool(title))
-        self.figure = Figure(figsize=size, layout="constrained")
+        self.figure = Figure(figsize=size, layout=Layout())
         axes = list(self.figure.subplots(rows, self.columns, squeeze=False).flat)
         for spare in axes[count:]:
             spare.remove()
@@ -158,7 +158,7 @@ class Sheet:
             height = self.figure.get_figheight() + below
             self.figure.set_figheight(height)
             engine: Any = self.figure.get_layout_engine()
-            engine.set(rect=(0, below / height, 1, 1 - below / height))
+            engine.set(rect=(0, strip / height, 1, 1))
             if self.x:
                 self.figure.supxlabel(self.x, y=strip / height + 0.02 / height, va="bottom")
         if found:

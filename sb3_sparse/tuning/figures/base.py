@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from sb3_sparse.pages.backend import Axes, Figure
+from sb3_sparse.pages.backend import Axes, Figure, Layout
 
 BEST, GREY, MEAN = "#362682", "#9a9a9a", "#222222"
 WIDTH, HEIGHT = 4.8, 3.0  # inches; this width needs no scrolling on a phone
 DPI = 144  # of what is drawn as pixels
-APART = {"wspace": 0.08}  # so that labels of panels side by side do not touch
 
 
 @dataclass(frozen=True)
@@ -37,8 +36,8 @@ def panels(count: int, columns: int = 1, height: float = HEIGHT) -> tuple[Figure
     """
     columns = min(columns, count)
     rows = -(-count // columns)
-    figure = Figure(figsize=(WIDTH, height * rows), dpi=DPI, layout="constrained")
-    axes = list(figure.subplots(rows, columns, squeeze=False, sharey=True, gridspec_kw=APART).flat)
+    figure = Figure(figsize=(WIDTH, height * rows), dpi=DPI, layout=Layout())
+    axes = list(figure.subplots(rows, columns, squeeze=False, sharey=True).flat)
     for spare in axes[count:]:
         spare.remove()
     return figure, axes[:count]
