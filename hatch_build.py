@@ -11,13 +11,13 @@ import shlex
 import shutil
 import subprocess
 import sys
-import sysconfig
 import tempfile
 from itertools import product
 from pathlib import Path
 from typing import Any
 
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
+from packaging.tags import platform_tags
 
 NATIVE = Path("sb3_sparse", "engine", "native")
 LIBRARY = NATIVE / "kernels.so"
@@ -42,6 +42,15 @@ def compiler() -> list[str] | None:
         return shlex.split(os.environ["CC"])
     found = next(filter(None, map(shutil.which, ("cc", "gcc", "clang"))), None)
     return None if found is None else [found]
+
+
+def this_platform() -> str:
+    """The platform in a wheel's name: of this machine, with no claim about other distributions.
+
+    Python's ``sysconfig`` may say "universal2" on a Mac, where the compiler builds for one
+    processor.
+    """
+    return next(tag for tag in platform_tags() if not tag.startswith(("manylinux", "musllinux")))
 
 
 def compile_kernels(source: Path, library: Path, extra: tuple[str, ...] = ()) -> None:
@@ -94,8 +103,7 @@ class KernelsHook(BuildHookInterface[Any]):
             return
         build_data["artifacts"].append(LIBRARY.as_posix())
         build_data["pure_python"] = False
-        target = sysconfig.get_platform().replace("-", "_").replace(".", "_")
-        build_data["tag"] = f"py3-none-{target}"
+        build_data["tag"] = f"py3-none-{this_platform()}"
 
 
 if __name__ == "__main__":  # python hatch_build.py: compile in place, for work on the C code

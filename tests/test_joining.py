@@ -86,6 +86,18 @@ def test_the_citation_is_of_this_version():
     assert citation["license"] == "MIT"
 
 
+def test_the_changelog_dates_this_version():
+    changelog = (ROOT / "CHANGELOG.md").read_text()
+    (date,) = re.findall(rf"^## \[{re.escape(sb3_sparse.__version__)}\] - (\S+)$", changelog, re.M)
+    assert date == yaml.safe_load((ROOT / "CITATION.cff").read_text())["date-released"]
+
+
+def test_a_release_is_published_once_all_of_it_is_built():
+    jobs = yaml.safe_load((ROOT / ".github/workflows/release.yml").read_text())["jobs"]
+    assert sorted(jobs["publish"]["needs"]) == sorted(jobs.keys() - {"publish"})
+    assert jobs["publish"]["permissions"] == {"id-token": "write"}
+
+
 def test_the_workflow_runs_the_script_of_ci_on_linux_and_macos():
     job = yaml.safe_load((ROOT / ".github/workflows/ci.yml").read_text())["jobs"]["test"]
     assert job["steps"][-1] == {"run": "bash .ci/run"}
