@@ -108,6 +108,7 @@ class Sheet:
         self.axes: list[Axes] = axes[:count]
         self.heads, self.rows = heads, list[Sequence[Any]]()
         self.title, self.x, self.y = title, x, y
+        self.beside = 0.0  # inches for names at the left of panels that no layout knows of
 
     def line(
         self,
@@ -154,13 +155,14 @@ class Sheet:
         across = max(1, min(len(found), int(width / entry)))
         strip = LINE * -(-len(found) // across) + 0.06 * bool(found)
         below = strip + LINE * bool(self.x)
-        if below:
+        if below or self.beside:
             height = self.figure.get_figheight() + below
             self.figure.set_figheight(height)
             engine: Any = self.figure.get_layout_engine()
-            engine.set(rect=(0, strip / height, 1, 1))
+            engine.set(rect=(self.beside / width, below / height, 1, 1))
             if self.x:
-                self.figure.supxlabel(self.x, y=strip / height + 0.02 / height, va="bottom")
+                text = self.figure.supxlabel(self.x, y=(strip + 0.02) / height, va="bottom")
+                text.set_in_layout(False)  # a layout would part it from the panels
         if found:
             self.figure.legend(
                 list(found.values()), list(found), loc="lower center", bbox_to_anchor=(0.5, 0),

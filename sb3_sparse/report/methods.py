@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from sb3_sparse.pages.look import Look
 from sb3_sparse.pages.names import METHODS
 
@@ -11,6 +13,8 @@ NAMES = {
     EQUAL: "Dense, equal parameters",
     **METHODS,
 }
+HEADLINE = 0.9
+"""The sparsity that stands for all where there is room for one."""
 
 
 # Colours are the paper's (IBM's colour-blind-safe palette) for what it compares, dense networks of
@@ -45,6 +49,11 @@ def in_order(labels: set[str]) -> list[str]:
     """Sort methods: dense, those of the paper in its order, other shipped ones, then by name."""
     known = [label for label in NAMES if label in labels]
     return known + sorted(labels - set(known))
+
+
+def headline(levels: Iterable[float]) -> float:
+    """Return the sparsity that stands for all: 90 %, or the nearest to it, of two the lower."""
+    return min(levels, key=lambda level: (abs(level - HEADLINE), level))
 
 
 def percent(level: float) -> str:

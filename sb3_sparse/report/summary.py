@@ -9,7 +9,7 @@ from typing import Any
 from sb3_sparse.pages.numbers import counted, short, shorten
 from sb3_sparse.pages.table import Cell, Table
 from sb3_sparse.report.data import RunData
-from sb3_sparse.report.methods import DENSE, EQUAL, in_order, name_of, percent
+from sb3_sparse.report.methods import DENSE, EQUAL, headline, in_order, name_of, percent
 from sb3_sparse.report.normalisation import possible_returns
 from sb3_sparse.report.results import Results, grouped
 from sb3_sparse.report.statistics import Estimate, mean
@@ -18,8 +18,6 @@ from sb3_sparse.report.verdicts import Verdict
 
 LEAST = 3
 """Seeds below which a mean has no interval here: that of two is mostly beyond possible returns."""
-HEADLINE = 0.9
-"""The sparsity of the sentence, or the nearest to it that was trained."""
 PLAIN = {DENSE: "dense", EQUAL: "dense of equal size"}
 
 
@@ -48,7 +46,7 @@ def sentences(results: Results) -> list[str]:
         for env_id in results.envs(family):
             here = [run for run in sparse if run.env_id == env_id]
             if here:
-                level = min({run.level for run in here}, key=lambda one: (abs(one - HEADLINE), one))
+                level = headline({run.level for run in here})
                 found.append(_sentence(results, family, env_id, level))
     return found
 

@@ -187,6 +187,39 @@ def test_few_methods_share_a_panel_for_each_sparsity(folders):
     assert figure.get_suptitle() == "DQN on CartPole-v1, 2 seeds"
 
 
+TALLEST = 10.4  # inches: 1,000 pixels of a screen
+
+
+def test_eight_rows_of_panels_fit_a_screen_and_tasks_are_named_at_the_left(folders):
+    levels = (0.5, 0.8, 0.9, 0.95)
+    many(folders, 2, levels=levels)
+    results = many(folders, 2, levels=levels, env_id="Acrobot-v1")
+    figure = draw("curves", results).figure
+    with styled():
+        figure.draw_without_rendering()
+    assert len(figure.axes) == 8 * 5
+    assert figure.get_figheight() <= TALLEST
+    names = [text for axes in figure.axes for text in axes.texts]
+    assert [text.get_text() for text in names] == ["Acrobot-v1", "CartPole-v1"]
+    first, second = (text.get_window_extent() for text in names)
+    assert first.x1 < figure.axes[0].yaxis.label.get_window_extent().x0
+    assert figure.axes[15].bbox.y0 < first.y0 < first.y1 < figure.axes[0].bbox.y1
+    assert figure.axes[35].bbox.y0 < second.y0 < second.y1 < figure.axes[20].bbox.y1
+
+
+def test_more_rows_than_a_screen_has_show_one_sparsity_of_each_task(folders):
+    for env_id in ("Acrobot-v1", "CartPole-v1"):
+        results = many(folders, 1, levels=(0.5, 0.8, 0.9, 0.95, 0.99), env_id=env_id)
+    drawing = draw("curves", results)
+    assert len(drawing.figure.axes) == 2 * 5
+    assert drawing.figure.get_suptitle() == "DQN on classic control, 90 % sparse, 1 seed"
+    assert [axes.get_ylabel() for axes in drawing.figure.axes[::5]] == ["Acrobot-v1", "CartPole-v1"]
+    assert {row[2] for row in drawing.rows} == {0.0, 0.5, 0.8, 0.9, 0.95, 0.99}
+    assert drawing.remarks == [
+        "all sparsities of a task but one, as there are too many; the CSV has their numbers"
+    ]
+
+
 def test_a_cell_without_runs_says_so(folders):
     many(folders, 1, ["dense", "prune", "static", "set", "rigl"], (0.8,))
     many(folders, 1, ["set", "static", "equal"], (0.95,))
@@ -199,9 +232,21 @@ def test_sparsities_stand_above_their_parameters(folders):
     results = many(folders, 2, ["dense", "rigl"], (0.5, 0.75, 0.875))
     (axes,) = draw("parameters", results).figure.axes
     (above,) = axes.child_axes
-    sizes = [64 * 64 // part + 10 for part in (8, 4, 2)]
+    sizes = [64 * 64 // part + 10 for part in (8, 4, 2, 1)]
     assert list(above.get_xticks()) == sizes
-    assert [text.get_text() for text in above.get_xticklabels()] == ["87.5", "75", "50"]
+    assert [text.get_text() for text in above.get_xticklabels()] == ["87.5", "75", "50", "0"]
+
+
+def test_seeds_of_the_dense_network_stand_at_its_size_and_its_mean_crosses_the_panel(folders):
+    results = many(folders, 2, ["dense", "rigl"], (0.5, 0.75))
+    scores = sorted(run.score for run in results.runs if run.label == "dense")
+    (axes,) = draw("parameters", results).figure.axes
+    grey = [line for line in axes.get_lines() if line.get_color() == LOOKS["dense"].color]
+    (dots,) = [line for line in grey if line.get_gid() == SEED]
+    assert sorted(dots.get_ydata()) == pytest.approx(scores)
+    assert list(dots.get_xdata()) == [64 * 64 + 10] * 2
+    (across,) = [line for line in grey if list(line.get_xdata()) == [0, 1]]
+    assert list(across.get_ydata()) == pytest.approx([np.mean(scores)] * 2)
 
 
 def test_lines_whose_ends_stand_apart_are_named_there_instead_of_in_a_legend(folders):

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sb3_sparse.pages.backend import Axes
+from sb3_sparse.pages.backend import Axes, Figure
 from sb3_sparse.pages.plot import GREY
 from sb3_sparse.report.data import Array
 from sb3_sparse.report.figures.grid import Grid, Place, Row
-from sb3_sparse.report.methods import DENSE, in_order, name_of, percent
+from sb3_sparse.report.methods import DENSE, headline, in_order, name_of, percent
 
-MOST_LINES = 4
+MOST_LINES, MOST_ROWS = 4, 9
 Line = tuple[str, float, str]
 """Method, sparsity, and all other settings."""
 
@@ -30,7 +30,7 @@ def no_runs(one: Axes) -> None:
 class Panel:
     """A panel of :func:`compared`.
 
-    :param axes: where it is drawn
+    :param axes: where it is drawn; outside the figure if there is no room in it
     :param place: what it is about
     :param level: the sparsity
     :param lines: the lines that belong into it
@@ -61,7 +61,8 @@ def compared(
     """Lay out lines: a row for each place, and a column for each sparsity.
 
     If a panel would have more than four lines, it is divided into one for each method, beside the
-    dense network of full size.
+    dense network of full size. If that makes more than nine rows of sparsities, each place shows
+    one, and the others are in the figure's numbers alone.
 
     :param lines: the lines of each place
     :param level_text: names a column
@@ -103,16 +104,30 @@ def compared(
             (place, i) for place in lines for i in range(len(down))
             if any(set(here(place, i, j)[2]) - shared for j in range(len(across)))
         ]  # fmt: skip
-        rows = [Row(place, down[i] if len(down) > 1 else "") for place, i in kept]
-        grid = Grid(heads, rows, across, x=x, y=y)
-        for down_at, (place, i) in enumerate(kept):
+        shown = kept
+        if methods_across and len(kept) > MOST_ROWS:
+            best = {
+                place: headline(levels[i] for other, i in kept if other == place) for place in lines
+            }
+            shown = [(place, i) for place, i in kept if levels[i] == best[place]]
+        if len({i for _, i in shown}) == 1:
+            down = [""] * len(down)
+        grid = Grid(heads, [Row(place, down[i]) for place, i in shown], across, x=x, y=y)
+        outside = Figure().subplots()
+        for place, i in kept:
             for j in range(len(across)):
                 level, label, inside = here(place, i, j)
-                panels.append(Panel(grid.at(down_at, j), place, level, inside, label))
+                axes = grid.at(shown.index((place, i)), j) if (place, i) in shown else outside
+                panels.append(Panel(axes, place, level, inside, label))
+        if shown != kept:
+            names = [names[i] for i in sorted({i for _, i in shown})]
+            grid.remarks = [
+                "all sparsities of a task but one, as there are too many; the CSV has their numbers"
+            ]
     for panel in panels:
         if shared.issuperset(panel.lines) and every - shared:
             no_runs(panel.axes)
-    if len(levels) == 1 and names[0] not in grid.names[: not grid.flowing]:
+    if len(names) == 1 and names[0] not in grid.names[: not grid.flowing]:
         grid.title = ", ".join(text for text in (grid.title, names[0]) if text)
     return grid, panels
 

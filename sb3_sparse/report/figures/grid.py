@@ -10,13 +10,15 @@ from sb3_sparse.intervals import mean_interval
 from sb3_sparse.pages.backend import Axes
 from sb3_sparse.pages.lines import ANY, Within, curve, points
 from sb3_sparse.pages.numbers import counted
-from sb3_sparse.pages.plot import TEXT, Drawing, Sheet
+from sb3_sparse.pages.plot import LINE, Drawing, Sheet
 from sb3_sparse.report.data import Array
 from sb3_sparse.report.methods import look_of
 
 MOST_FLOWING = 3
 WIDTHS = {1: 4.6, 2: 3.8, 3: 3.2, 4: 2.6, 5: 2.25}
-NARROW, HIGH, LOW = 2.05, 2.3, 1.5
+NARROW, HIGH, LOW, LEAST = 2.05, 2.3, 1.5, 1.0
+BETWEEN = -0.08  # the share of a panel's height at which the gap to the next row has its middle
+ROOM = 9.2  # inches for all rows, so that a figure fits a screen
 
 
 @dataclass(frozen=True, order=True)
@@ -55,7 +57,7 @@ class Grid(Sheet):
     :param columns: the columns' names
     :param x: the label below
     :param y: the label at the left
-    :param height: height of a row, in inches; None for a usual one
+    :param height: height of a row, in inches; None for one with which rows fit a screen
     :param above: points that ticks above panels take
     """
 
@@ -75,13 +77,16 @@ class Grid(Sheet):
         self.flowing = len(columns) == 1 and len(rows) == len(places) > 1
         across = min(len(rows), MOST_FLOWING) if self.flowing else len(columns)
         usual = LOW if len(rows) > len(places) else HIGH
+        down = -(-len(rows) // across) if self.flowing else len(rows)
+        fitting = max(LEAST, min(usual, ROOM / down - above / 72))
         super().__init__(
-            heads, len(rows) * len(columns), across, (height or usual) + above / 72,
+            heads, len(rows) * len(columns), across, (height or fitting) + above / 72,
             width=WIDTHS.get(across, NARROW), title=title, x=x, y=y,
         )  # fmt: skip
         self.lines_of = list(rows)
         self.names, self.above = list(columns), above
         self.counts: set[int] = set()
+        self.remarks: list[str] = []
         self.noted: set[Any] = set()
         for place in places:
             first, *others = self.group(place)
@@ -100,6 +105,23 @@ class Grid(Sheet):
             self.at(i, j) for i, row in enumerate(self.lines_of) if row.place == place
             for j in across
         ]  # fmt: skip
+
+    def _name(self, place: Place) -> None:
+        """Name a place at the left of its rows: once, in the middle, if rows have names too."""
+        rows = [i for i, row in enumerate(self.lines_of) if row.place == place]
+        text = _broken(self.texts[place])
+        for i in rows:
+            self.at(i, 0).set_ylabel(_broken(self.lines_of[i].name) or text)
+        if self.lines_of[rows[0]].name and text:
+            middle = self.at(rows[(len(rows) - 1) // 2], 0)
+            height = BETWEEN if len(rows) % 2 == 0 else 0.5
+            name = middle.annotate(
+                text, (0, height), (-5, 0), textcoords="offset points",
+                xycoords=(middle.yaxis.label, middle.transAxes), ha="right", va="center",
+                ma="center", rotation=90, weight="bold", annotation_clip=False,
+            )  # fmt: skip
+            name.set_in_layout(False)  # it is longer than its panel, and must not part the rows
+            self.beside = max(self.beside, LINE * (1 + text.count("\n")))
 
     def curve(
         self, one: Axes, place: Sequence[Any], x: Sequence[float], seeds: Array, label: str,
@@ -143,6 +165,7 @@ class Grid(Sheet):
     def drawing(self, remarks: Sequence[str] = ()) -> Drawing:
         """Finish the figure: names of rows and columns, and ticks at the outside alone."""
         rows, columns = len(self.lines_of), len(self.names)
+        remarks = [*self.remarks, *remarks]
         if self.counts:
             low, high = min(self.counts), max(self.counts)
             seeds = f"{low} to {high} seeds" if low < high else counted(high, "seed")
@@ -155,16 +178,10 @@ class Grid(Sheet):
             self.at(0, j).set_title(_broken(name))
         last = {row.place: i for i, row in enumerate(self.lines_of)}
         same = len({self.at(i, 0).get_xlim() for i in last.values()}) == 1
+        for place in last:
+            self._name(place)
+        self.figure.align_ylabels([self.at(i, 0) for i in range(rows)])
         for i, row in enumerate(self.lines_of):
-            begins = i == 0 or self.lines_of[i - 1].place != row.place
-            text = self.texts[row.place]
-            self.at(i, 0).set_ylabel(_broken(row.name or text))
-            if row.name and text and begins:
-                title = TEXT * 1.35 * (1 + _broken("".join(self.names)).count("\n")) * (i == 0)
-                self.at(i, 0).annotate(
-                    text, (0, 1), (0, 7 + self.above + title), xycoords="axes fraction",
-                    textcoords="offset points", weight="bold", annotation_clip=False,
-                )  # fmt: skip
             ends = i == rows - 1 or (i == last[row.place] and not same)
             for j in range(columns):
                 self.at(i, j).tick_params(labelbottom=ends, labelleft=j == 0)

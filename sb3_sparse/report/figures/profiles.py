@@ -61,7 +61,7 @@ def draw(results: Results) -> Drawing:
                 grid.note(rows, taus.tolist(), ends, counts)
             drawn = shown(ends, [len(values)] * len(taus))
             drawn_line(panel.axes, taus.tolist(), drawn, look_of(label), panel.text(label))
-        panel.axes.set_ylim(-0.03, 1.03)
+        panel.axes.set_ylim(-0.07, 1.07)
     many = " to ".join(map(str, sorted({*tasks.values()})))
     grid.title = f"{grid.title}, {many} task{'s' * (many != '1')}".removeprefix(", ")
     return grid.drawing(remarks)
