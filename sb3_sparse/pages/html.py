@@ -22,7 +22,8 @@ STYLE = """
 }
 * { box-sizing: border-box; }
 body { background: var(--page); font: 16px/1.5 system-ui, sans-serif; margin: 0 auto;
-  max-width: 78rem; padding: 1rem; }
+  max-width: 84rem; padding: 1rem; }
+p, li, figcaption { max-width: 60rem; }
 h1 { font-size: 1.7rem; line-height: 1.2; } h2 { margin-top: 2.5rem; }
 h1, h2, h3, p, li, code, figcaption, summary { overflow-wrap: anywhere; }
 a { color: var(--link); }

@@ -41,7 +41,7 @@ class Table:
     def varying(self, *keep: str) -> tuple[Table, dict[str, Any]]:
         """Return the table without the columns whose entries are all equal, and what these hold.
 
-        A table of one row keeps its columns; an empty column is left out without a word.
+        A table of one row keeps its columns; an empty one is left out without a word of any table.
 
         :param keep: heads of columns that stay
         """
@@ -49,8 +49,8 @@ class Table:
         same = {
             place: column[0]
             for place, column in enumerate(columns)
-            if len(column) > 1
-            and self.heads[place] not in keep
+            if self.heads[place] not in keep
+            and (len(column) > 1 or column[0] is None)
             and all(entry == column[0] for entry in column)
         }
         kept = [place for place in range(len(self.heads)) if place not in same]

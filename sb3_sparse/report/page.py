@@ -11,9 +11,10 @@ from sb3_sparse.pages.table import Cell, Table
 from sb3_sparse.report.data import LeftOut
 from sb3_sparse.report.figures import FIGURES
 from sb3_sparse.report.findings import FINDINGS
+from sb3_sparse.report.leads import leads
 from sb3_sparse.report.methods import percent
 from sb3_sparse.report.results import Results
-from sb3_sparse.report.summary import scores, sentences, verdict_in_words
+from sb3_sparse.report.summary import scores
 from sb3_sparse.report.tables import findings_table
 from sb3_sparse.report.verdicts import LEAST_SEEDS, Verdict
 
@@ -101,9 +102,10 @@ def render(content: Content) -> str:
     """Return the page's HTML: what was found, what shows it, and what it is made of."""
     drawn = [shown for shown in content.figures if shown.svg is not None]
     hero, more = drawn[:1], [shown for shown in content.figures if shown not in drawn[:1]]
-    lead = map(html.lead, [*_verdict_of(content), *sentences(content.results)])
+    lead = map(html.lead, leads(content.results, content.verdicts))
     sections = [
-        *_scores(content.results, hero),
+        *([html.section("Main figure", *map(_figure, hero))] if hero else ()),
+        *_scores(content.results),
         _findings(content),
         *([html.section("Figures", *map(_figure, more))] if more else ()),
         _cells(content),
@@ -113,12 +115,6 @@ def render(content: Content) -> str:
         *_pending(content),
     ]
     return html.page(content.title, [*lead, html.paragraph(_counts(content))], sections)
-
-
-def _verdict_of(content: Content) -> list[str]:
-    """Return the outcome of a study that tests a single finding, which is what it is about."""
-    single = len({one.finding.key for one in content.verdicts}) == 1
-    return list(map(verdict_in_words, content.verdicts)) if single else []
 
 
 def _counts(content: Content) -> str:
@@ -137,11 +133,11 @@ def _counts(content: Content) -> str:
     return f"{finished}{also}, {steps:,} environment steps{missing}."
 
 
-def _scores(results: Results, hero: Sequence[Shown]) -> list[html.Section]:
-    found = scores(results)
+def _scores(results: Results) -> list[html.Section]:
     parts = [
-        html.subsection(one.title, html.table(one.table), html.paragraph(one.note)) for one in found
-    ] + [_figure(shown) for shown in hero]
+        html.subsection(one.title, html.table(one.table), html.paragraph(one.note))
+        for one in scores(results)
+    ]
     return [html.section("Scores", *parts)] if parts else []
 
 

@@ -14,11 +14,10 @@ from sb3_sparse.report.normalisation import possible_returns
 from sb3_sparse.report.results import Results, grouped
 from sb3_sparse.report.statistics import Estimate, mean
 from sb3_sparse.report.values import order_of, shown_value
-from sb3_sparse.report.verdicts import Verdict
 
 LEAST = 3
 """Seeds below which a mean has no interval here: that of two is mostly beyond possible returns."""
-PLAIN = {DENSE: "dense", EQUAL: "dense of equal size"}
+PLAIN = {DENSE: "dense", EQUAL: "dense of equal parameters"}
 
 
 @dataclass(frozen=True)
@@ -63,22 +62,14 @@ def _sentence(results: Results, family: str, env_id: str, level: float) -> str:
     digits = _digits([means[label].value for label in named])
     seeds = {means[label].seeds for label in named}
     texts = [
-        f"{name} {_interval(means[label], digits)}" + ("" if len(seeds) == 1 else _of(means[label]))
+        f"{name} {_interval(means[label], digits)}"
+        + ("" if len(seeds) == 1 else f" ({counted(means[label].seeds, 'seed')})")
         for label, name in named.items()
     ]
     if len(methods) > 1:
         texts[0] += f", the highest mean of {len(methods)} sparse methods"
     end = f"; {counted(seeds.pop(), 'seed')}" if len(seeds) == 1 else ""
-    return f"{_task(results, family, env_id)} at {percent(level)}: {'; '.join(texts)}{end}."
-
-
-def verdict_in_words(verdict: Verdict) -> str:
-    """Say in a sentence what became of a finding."""
-    text = f"{verdict.finding.text.removesuffix('.')}: {verdict.verdict}"
-    if not verdict.shown:
-        return f"{text} ({verdict.remark})."
-    seeds = counted(verdict.seeds, "seed")
-    return f"{text}, {verdict.shown} of the {verdict.finding.unit}; {seeds}."
+    return f"{task_of(results, family, env_id)} at {percent(level)}: {'; '.join(texts)}{end}."
 
 
 def scores(results: Results) -> list[Scores]:
@@ -88,7 +79,9 @@ def scores(results: Results) -> list[Scores]:
         for env_id in results.envs(family):
             cells = _by_setting(results, family, env_id) or _by_level(results, family, env_id)
             if cells:
-                found.append(_table(_task(results, family, env_id), env_id, cells, results.varies))
+                found.append(
+                    _table(task_of(results, family, env_id), env_id, cells, results.varies)
+                )
     return found
 
 
@@ -195,6 +188,7 @@ def _named(label: str, level: float | None) -> str:
     return f"{name_of(label)}, {percent(level)}"
 
 
-def _task(results: Results, family: str, env_id: str) -> str:
+def task_of(results: Results, family: str, env_id: str) -> str:
+    """Name a task, with its algorithm if there are several."""
     several = len(results.families()) > 1
     return f"{family.split(' on ', 1)[0]}, {env_id}" if several else env_id

@@ -13,7 +13,7 @@ from sb3_sparse.report.sides import Sides
 from sb3_sparse.report.statistics import difference, rectangle
 
 LEAST_SEEDS = 3
-NOTHING = 0.005
+NOTHING, MOST_DECIMALS = 0.005, 6
 NO_MARGIN = "the other side's IQM is not above 0, so no margin can be a share of it"
 
 
@@ -62,11 +62,7 @@ class Verdict:
         """
         if self.effect is None or self.low is None or self.high is None:
             return ""
-        value, low, high = (
-            f"{one:+.1g}" if 0 < abs(one) < NOTHING else f"{one:+.2f}"
-            for one in (self.effect, self.low, self.high)
-        )
-        return f"{value} [{low}; {high}]"
+        return f"{signed(self.effect)} [{signed(self.low)}; {signed(self.high)}]"
 
     @property
     def holds(self) -> str:
@@ -82,6 +78,14 @@ class Verdict:
     def has_data(self) -> bool:
         """Whether there are runs of both sides, however few."""
         return bool(self.family)
+
+
+def signed(effect: float) -> str:
+    """Write an effect with its sign and two decimals, or as many as its first digit needs."""
+    if not effect or abs(effect) >= NOTHING:
+        return f"{effect:+.2f}"
+    digits = min(-math.floor(math.log10(abs(effect))), MOST_DECIMALS)
+    return f"{effect:+.{digits}f}"
 
 
 def judge(results: Results) -> list[Verdict]:

@@ -158,6 +158,18 @@ def test_bands_end_at_the_returns_that_are_possible_and_the_numbers_do_not(folde
     assert max(row[column] for row in drawing.rows) > 500
 
 
+def test_the_axis_of_noise_has_its_unit(folders):
+    def labels():
+        return draw("noise", results_of(folders.made)).figure.get_supxlabel()
+
+    folders.add("rigl", 0.9, noise={0.0: 2.0, 1.0: 1.0})
+    assert labels() == "noise, in standard deviations of the observation"
+    folders.add("rigl", 0.9, env_id="PongNoFrameskip-v4", noise={0.0: 2.0, 5.0: 1.0})
+    assert labels() == "standard deviation of the noise"
+    del folders.made[0]
+    assert labels() == "standard deviation of the noise, grey levels"
+
+
 def test_possible_returns_are_those_of_the_tasks():
     assert possible_returns("CartPole-v1") == (0, 500)
     assert possible_returns("Acrobot-v1") == (-500, 0)
@@ -330,9 +342,9 @@ def test_findings_show_the_verdicts_and_each_cell_compared(compared):
     assert [row["seeds"] for row in rows] == [3, 3, 3]
     assert [row["seeds of the other side"] for row in rows] == [3, 3, 1]
     asides = [text.get_text() for text in axes.child_axes[0].get_yticklabels()]
-    assert asides[0].startswith("3 + 3 seeds  0.33 [")
+    assert asides[0].startswith("3 + 3 seeds  +0.33 [")
     assert asides[0].endswith("supported")
-    assert asides[2] == "3 + 1 seeds  0.15"
+    assert asides[2] == "3 + 1 seeds  +0.15"
     (region,) = marked(axes, REGION)
     assert region.get_datalim(axes.transData).x0 == 0.0
 

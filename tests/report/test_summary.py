@@ -33,7 +33,7 @@ def test_the_first_sentence_tells_what_the_best_sparse_method_scores(folders):
     add(folders, "rigl", 0.99, [400.0, 400.0, 400.0])
     assert sentences(results(folders)) == [
         "CartPole-v1 at 90 %: SET 310 [290; 330], the highest mean of 2 sparse methods; dense 210 "
-        "[190; 230]; dense of equal size 110 [85; 130]; 3 seeds."
+        "[190; 230]; dense of equal parameters 110 [85; 130]; 3 seeds."
     ]
 
 
@@ -41,7 +41,7 @@ def test_intervals_hold_no_return_that_is_impossible_and_two_seeds_have_none(fol
     add(folders, "static", 0.8, [500.0, 500.0, 350.0])  # 450 +- 215 by Student's t
     add(folders, "dense", None, [400.0, 300.0])
     assert sentences(results(folders)) == [
-        "CartPole-v1 at 80 %: Static 450 [230; 500] (3); dense 350 (2)."
+        "CartPole-v1 at 80 %: Static 450 [230; 500] (3 seeds); dense 350 (2 seeds)."
     ]
 
 

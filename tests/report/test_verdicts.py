@@ -230,5 +230,5 @@ def test_only_the_findings_that_are_asked_for_are_judged(folders):
 
 def test_an_effect_shows_on_which_side_of_nothing_its_ends_lie():
     shown = Verdict(FINDINGS[0], "DQN", UNDECIDED, -0.224, -0.458, 0.00004).shown
-    assert shown == "-0.22 [-0.46; +4e-05]"
+    assert shown == "-0.22 [-0.46; +0.00004]"
     assert Verdict(FINDINGS[0], "", UNDECIDED).shown == ""

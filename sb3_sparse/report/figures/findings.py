@@ -17,7 +17,7 @@ from sb3_sparse.report.findings import FINDINGS, check_findings
 from sb3_sparse.report.methods import name_of
 from sb3_sparse.report.results import NotEnoughData, Results
 from sb3_sparse.report.statistics import Estimate, mean_difference
-from sb3_sparse.report.verdicts import LEAST_SEEDS, Verdict, judge
+from sb3_sparse.report.verdicts import LEAST_SEEDS, Verdict, judge, signed
 
 HEADS = ("finding", "algorithm and tasks", "compared", "effect", "low", "high", "unit", "seeds",
          "seeds of the other side", "verdict")  # fmt: skip
@@ -185,9 +185,9 @@ def _aside(line: _Line) -> str:
 
 
 def _text(number: float) -> str:
-    """Write a number with two decimals, so that those below each other compare."""
-    text = f"{number:.2f}" if abs(number) < 10 else short(number)
-    return text.replace("-0.00", "0.00").replace("-", "\N{MINUS SIGN}")
+    """Write an effect as tables do, and a very large one in two digits."""
+    text = signed(number) if abs(number) < 10 else short(number)
+    return text.replace("-", "\N{MINUS SIGN}")
 
 
 def _shade(one: Axes, verdict: Verdict, top: int, rows: int) -> None:
