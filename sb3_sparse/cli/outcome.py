@@ -79,9 +79,11 @@ def _tell_curve(outcome: Outcome) -> None:
 
     folder = RunFolder(outcome.folder)
     try:
-        from sb3_sparse.zoo.curve import write_curve
+        from sb3_sparse.zoo.curve import what_was_trained, write_curve
 
-        drawn = write_curve(folder, "/".join(outcome.folder.parts[-2:]))
+        record = folder.record()
+        title = what_was_trained(record.spec, str(record["method"]), outcome.sparsity)
+        drawn = write_curve(folder, title)
     except Exception as error:
         say(f"No learning curve: {_reason(error)}")
         return

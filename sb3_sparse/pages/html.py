@@ -53,6 +53,7 @@ figure { margin: 1rem 0 2rem; }
 .row { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 28rem), 1fr));
   gap: 0 1rem; }
 .row > * { min-width: 0; }
+.row > :last-child:nth-child(odd) { grid-column: 1 / -1; }
 .frame { background: #fff; border: 1px solid var(--line); border-radius: 6px;
   padding: .5rem; overflow-x: auto; }
 figure img { display: block; max-width: 100%; height: auto; margin: 0 auto; }

@@ -7,14 +7,14 @@ from typing import Any
 
 from sb3_sparse.errors import SparsityError
 from sb3_sparse.pages import html
-from sb3_sparse.pages.numbers import short, shorten
+from sb3_sparse.pages.numbers import short
 from sb3_sparse.pages.table import Cell, Table
 from sb3_sparse.sparsity.numeric import is_number
 from sb3_sparse.tuning.backend import BaseStorage, optuna
 from sb3_sparse.tuning.definition import Definition
 from sb3_sparse.tuning.search import DEFINITION, Search
 from sb3_sparse.tuning.values import best_of, score_of, spelled, value_text, varied
-from sb3_sparse.tuning.words import in_words, what
+from sb3_sparse.tuning.words import DIGITS, in_words, what
 
 TOP = 10
 
@@ -31,7 +31,9 @@ def best_trials(search: Search) -> tuple[str, list[str]]:
     }
     if search.definition.seeds > 1:
         seeds = (trial.user_attrs.get("scores", []) for trial in best)
-        columns["score of each seed"] = [", ".join(map(short, scores)) for scores in seeds]
+        columns["score of each seed"] = [
+            ", ".join(short(score, DIGITS) for score in scores) for scores in seeds
+        ]
     for name in varied(search):
         columns[spelled(name)] = [_value(trial.params.get(name)) for trial in best]
     title = "The best trial" if len(best) == 1 else f"The {len(best)} best trials"
@@ -95,8 +97,8 @@ def _scores(scores: Sequence[float], groups: Sequence[Any] | None = None) -> lis
         for group in groups
     }
     return [
-        Cell(score, text, strong=score == best[group])
-        for score, text, group in zip(scores, shorten(scores), groups, strict=True)
+        Cell(score, short(score, DIGITS), strong=score == best[group])
+        for score, group in zip(scores, groups, strict=True)
     ]
 
 

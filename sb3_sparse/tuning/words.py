@@ -18,7 +18,7 @@ from sb3_sparse.tuning.spaces import (
 from sb3_sparse.tuning.values import best_of, choices_of, score_of, spelled, value_text, varied
 from sb3_sparse.zoo.configs import DENSE
 
-DIGITS = 3  # of the scores in the sentence that opens the page
+DIGITS = 3  # of scores, in the sentence that opens the page and in its tables
 
 
 def outcome(search: Search) -> str:

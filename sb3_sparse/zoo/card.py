@@ -12,12 +12,10 @@ import yaml
 
 from sb3_sparse.errors import ConfigError, command
 from sb3_sparse.files import written_whole
-from sb3_sparse.pages.names import METHODS
 from sb3_sparse.pages.plot import save_png
 from sb3_sparse.policies.report import SparsityReport
 from sb3_sparse.zoo.archive import Archived
-from sb3_sparse.zoo.configs import DENSE
-from sb3_sparse.zoo.curve import CURVE, curve
+from sb3_sparse.zoo.curve import CURVE, curve, what_was_trained
 from sb3_sparse.zoo.folder import RunFolder, env_name
 from sb3_sparse.zoo.inspection import inspect_model
 from sb3_sparse.zoo.record import Record, Status
@@ -248,10 +246,7 @@ class Card:
 
     @property
     def _title(self) -> str:
-        method = str(self._record["method"])
-        name = METHODS.get(method, method)
-        how = name if method == DENSE else f"{name} at {self.report.sparsity():.0%} sparsity"
-        return f"{self._algorithm} on {self.spec.env_id}, {how}"
+        return what_was_trained(self.spec, str(self._record["method"]), self.report.sparsity())
 
 
 def _fenced(language: str, lines: Sequence[str]) -> Iterator[str]:

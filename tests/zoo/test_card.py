@@ -75,7 +75,7 @@ def test_the_hub_reads_what_it_reads_of_huggingface_sb3(folder, best, what):
     card = ModelCard.load(path)
     (found,) = card.data.eval_results
     assert found.metric_value == f"{one['mean_return']:.2f} +/- {one['std_return']:.2f}"
-    assert card.text.lstrip().startswith("# DQN on CartPole-v1, RigL at 79% sparsity\n")
+    assert card.text.lstrip().startswith("# DQN on CartPole-v1, RigL at 79.4% sparsity\n")
     assert (
         f"| {what} | {one['mean_return']:.2f} | {one['std_return']:.2f} | 3 | `{one['path']}` |"
         in card.text

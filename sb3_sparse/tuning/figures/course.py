@@ -32,7 +32,7 @@ def history(search: Search) -> Picture:
     best = best_of(search)
     axes.scatter([best.number], [score_of(best)], s=36, color=BEST, zorder=3)
     _name(axes, best)
-    axes.set(xlabel="Trial", ylabel="Score")
+    axes.set(xlabel="trial", ylabel="score")
     axes.xaxis.set_major_locator(MaxNLocator(6, integer=True, min_n_ticks=1))
     texts = ["The score of each trial, and in colour the best so far."]
     if last:
@@ -55,7 +55,7 @@ def evaluations(search: Search) -> Picture:
         else:
             axes.plot(steps, returns, color=GREY, linewidth=0.7, alpha=0.7, rasterized=many)
     _name(axes, best)
-    axes.set(xlabel="Environment steps", ylabel="Mean return")
+    axes.set(xlabel="environment steps", ylabel="mean return")
     axes.xaxis.set_major_locator(MaxNLocator(5, integer=True))
     axes.xaxis.set_major_formatter(lambda x, _: f"{x:,.0f}")
     seeds = search.definition.seeds

@@ -56,7 +56,7 @@ def _line(choices: Mapping[str, list[Any]], trials: Sequence[FrozenTrial]) -> Pi
     line = "-" if all(map(is_number, values)) else ""
     axes.plot(seen, means, color=BEST, marker="o", linestyle=line)
     _at_choices(axes, values)
-    axes.set(xlabel=spelled(name), ylabel="Score")
+    axes.set(xlabel=spelled(name), ylabel="score")
     text = "The mean score of each value in colour, and the score of each seed in grey."
     return Picture("values", f"Scores by {spelled(name)}", text, figure)
 
@@ -119,7 +119,7 @@ def _slices(
         chosen = [at for at, trial in zip(x, there, strict=True) if trial.number == best.number]
         one.scatter(chosen, [score_of(best)] * len(chosen), s=36, color=BEST, lw=0, zorder=3)
         one.set_xlabel(spelled(name))
-    figure.supylabel("Score", fontsize="medium")
+    figure.supylabel("score")
     text = "Each dot is a completed trial; the best one in colour."
     if any(isinstance(one, CategoricalDistribution) for one in names.values()):
         text += " Short lines are the means of values that several trials share."
