@@ -158,7 +158,8 @@ def line(row: dict[str, Any]) -> str:
 def table(path: Path) -> None:
     """Print a CSV file as Markdown: a line for each case, sparsity and method.
 
-    Parts of a step are those of ours, or of the plug-in where ours does not exist.
+    It has medians, the file the ranges of the rounds. Parts of a step are those of ours, or of the
+    plug-in where ours does not exist, as shares of stock's.
     """
     found: dict[tuple[str, ...], dict[str, dict[str, dict[str, str]]]] = {}
     with path.open(newline="") as file:
@@ -168,34 +169,29 @@ def table(path: Path) -> None:
             shown = f"{float(row['sparsity']):.0%}{how}" if row["sparsity"] else ""
             found.setdefault(key, {}).setdefault(shown, {})[kind_of(row)] = row
 
-    def rates(row: dict[str, str] | None) -> str:
-        if row is None:
-            return ""
-        numbers = [float(row[name]) for name in ("steps_per_second", "lowest", "highest")]
-        return "{} ({} to {})".format(*(f"{number:.4g}" for number in numbers))
+    def rate(row: dict[str, str] | None) -> str:
+        steps = float(row["steps_per_second"]) if row else 0.0
+        return "" if row is None else f"{steps:,.0f}" if steps >= 100 else f"{steps:.3g}"
 
     def ratio(row: dict[str, str] | None) -> str:
         return "" if row is None else f"{float(row['ratio']):.2f}"
 
     print(
         "| case | environment | sparsity | stock, steps/s | SBX | plug-in | ours | SBX / stock "
-        "| plug-in / stock | ours / stock | rollout part, us: stock, sparse, ratio "
-        "| action, us: stock, sparse, ratio |"
+        "| plug-in / stock | ours / stock | rollout part / stock | action / stock |"
     )
-    print("|---" * 12 + "|")
+    print("|---" * 3 + "|---:" * 9 + "|")
     for (case, env, activation), by_sparsity in found.items():
         dense = by_sparsity.pop("")
         stock, sbx = dense["stock"], dense.get("sbx")
         for shown, rows in by_sparsity.items():
             plugin, ours = rows.get("plug-in"), rows.get("ours")
             cells = [f"{case} {activation}".strip(), env, shown]
-            cells += map(rates, (stock, sbx, plugin, ours))
+            cells += map(rate, (stock, sbx, plugin, ours))
             cells += [ratio(sbx), ratio(plugin), f"**{ratio(ours)}**" if ours else ""]
             sparse = ours or plugin
             assert sparse is not None
-            for part in ("rollout", "act"):
-                both = [f"{float(row[f'{part}_us']):.0f}" for row in (stock, sparse)]
-                cells.append(", ".join([*both, f"{float(sparse[f'{part}_ratio']):.2f}"]))
+            cells += [f"{float(sparse[f'{part}_ratio']):.2f}" for part in ("rollout", "act")]
             print("| " + " | ".join(cells) + " |")
 
 

@@ -172,8 +172,10 @@ class Drawn:
                 if verdict != UNDECIDED:
                     decided.add(finding.key)
                     verdict = f"**{verdict}**"
-                cells = (link, verdict, one.shown, one.holds, str(one.seeds), by)
+                effect = one.shown.replace(" ", "\N{NO-BREAK SPACE}")
+                cells = (link, by, verdict, effect, one.holds, str(one.seeds))
                 rows.append(f"| {' | '.join(cells)} |")
+                link = ""  # said once
             if not self._judged(finding.key):
                 begun = any(
                     one.has_data and one.finding.key == finding.key
@@ -181,14 +183,14 @@ class Drawn:
                     for one in self.shown(*where).verdicts
                 )
                 why = "fewer than three seeds" if begun else "no runs yet"
-                rows.append(f"| {link} | {why} | | | | |")
+                rows.append(f"| {link} | | {why} | | | |")
         yield (
             f"**{len(decided)} of {len(FINDINGS)} findings are decided so far.** An effect without "
             "a verdict says where it may lie, and no more."
         )
         yield ""
-        yield "| the paper's finding | verdict | effect [95 % interval] | holds for | seeds | by |"
-        yield "| --- | --- | --- | --- | --- | --- |"
+        yield "| the paper's finding | by | verdict | effect [95 % interval] | holds for | seeds |"
+        yield "| --- | --- | --- | ---: | --- | ---: |"
         yield from rows
 
     def _judged(self, key: str) -> list[tuple[Verdict, Shown]]:

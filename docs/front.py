@@ -7,7 +7,7 @@ from pathlib import Path
 from statistics import fmean
 
 from sb3_sparse.pages.backend import Axes
-from sb3_sparse.pages.lines import logarithmic
+from sb3_sparse.pages.lines import RUN, dots, logarithmic
 from sb3_sparse.pages.numbers import short
 from sb3_sparse.pages.plot import Drawing, Sheet, styled
 from sb3_sparse.report import Results
@@ -70,7 +70,7 @@ def _returns_by_size(one: Axes, results: Results) -> None:
             ]
             values = [score for run in runs if (score := results.normaliser(run)) is not None]
             size = fmean(run.parameters for run in runs)
-            one.plot([size] * len(values), values, ".", color=look.color, alpha=0.35, markersize=5)
+            dots(one, [size] * len(values), values, look, RUN)
             points.append((size, fmean(values)))
         x, y = zip(*points, strict=True)
         one.plot(

@@ -64,7 +64,7 @@ def test_the_table_has_a_line_for_each_sparsity_and_method(end_to_end, capsys, t
         dict(row, case="sac-8", contender="stock", sparsity=""),
         dict(row, case="sac-8", contender="sbx", sparsity="", ratio=1.5),
         dict(row, case="sac-8", contender="plug-in", sparsity=0.9, ratio=2.0),
-        dict(row, case="sac-8", contender="ours", sparsity=0.9, ratio=4.0, rollout_us=3.0),
+        dict(row, case="sac-8", contender="ours", sparsity=0.9, ratio=4.0, rollout_ratio=0.75),
         dict(row, case="sac-8", contender="ours", sparsity=0.0, ratio=1.25),
     ]
     path = tmp_path / "rows.csv"
@@ -72,11 +72,11 @@ def test_the_table_has_a_line_for_each_sparsity_and_method(end_to_end, capsys, t
         for one in rows:
             write(one)
     end_to_end.table(path)
-    rate, same = "1 (1 to 1)", "1, 1, 1.00"
+    rate, same = "1", "1.00"
     assert capsys.readouterr().out.splitlines()[2:] == [
         f"| tqc-8 | E-v0 | 90%, rigl | {rate} |  | {rate} |  |  | 2.00 |  | {same} | {same} |",
         f"| sac-8 | E-v0 | 90% | {rate} | {rate} | {rate} | {rate} | 1.50 | 2.00 | **4.00** "
-        f"| 1, 3, 1.00 | {same} |",
+        f"| 0.75 | {same} |",
         f"| sac-8 | E-v0 | 0% | {rate} | {rate} |  | {rate} | 1.50 |  | **1.25** "
         f"| {same} | {same} |",
     ]
