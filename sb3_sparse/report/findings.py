@@ -181,6 +181,7 @@ FINDINGS = (
         by_noise, GREATER, _average, MEAN_UNIT,
     ),
 )  # fmt: skip
+"""The paper's findings, in the order in which pages judge them."""
 
 
 def check_findings(keys: Iterable[str]) -> None:

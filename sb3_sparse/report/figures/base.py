@@ -29,6 +29,7 @@ class Entry:
 
 
 FIGURES: dict[str, Entry] = {}
+"""Every figure by its name, as studies and :func:`sb3_sparse.report.write_report` take it."""
 
 
 def figure(name: str, title: str, caption: str) -> Callable[[DrawT], DrawT]:
