@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from statistics import fmean
 
+from sb3_sparse.pages.numbers import counted
 from sb3_sparse.report.data import RunData
 from sb3_sparse.report.methods import DENSE
 from sb3_sparse.zoo.environments import ATARI, DM_CONTROL, game_of, suite_of
@@ -112,7 +113,8 @@ class Normaliser:
     def statements(self) -> list[str]:
         """Return a line for each task that tells what 0 and 1 stand for."""
         return [
-            f"{family}, {env_id}: 0 is {scale.zero:.6g}, 1 is {scale.one:.6g} ({scale.source})"
+            f"{family}, {env_id}: 0 stands for a score of {scale.zero:.4g}, 1 for {scale.one:.4g} "
+            f"({scale.source})"
             for (family, env_id), scale in self.scales.items()
         ]
 
@@ -131,4 +133,4 @@ def _by_dense(runs: list[RunData]) -> Scale | str:
     mean = fmean(scores)
     if mean <= 0:
         return f"the dense network's mean score is {mean:.6g}, by which nothing can be divided"
-    return Scale(0.0, mean, f"divided by the mean of {len(scores)} dense run(s) of full size")
+    return Scale(0.0, mean, f"the mean of {counted(len(scores), 'dense run')} of full size")

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from sb3_sparse.errors import SparsityError
+from sb3_sparse.pages.numbers import counted
 from sb3_sparse.report.data import RunData
 from sb3_sparse.report.methods import DENSE, in_order
 from sb3_sparse.report.normalisation import Normaliser
@@ -138,8 +139,9 @@ def choose(runs: Sequence[RunData]) -> tuple[list[RunData], list[str]]:
             family, env_id, label, level = cell
             remarks.append(
                 f"{family}, {env_id}, {label} at {level:g}: {len(variants)} variants of settings; "
-                f"methods are compared by {len(variants[chosen])} run(s) of one, {others} "
-                "run(s) of the others are in the tables and in figures about settings only"
+                f"methods are compared by {counted(len(variants[chosen]), 'run')} of one, "
+                f"{counted(others, 'run')} of the others are in the tables and in figures about "
+                "settings only"
             )
     return main, remarks
 

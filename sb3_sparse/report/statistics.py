@@ -28,6 +28,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sb3_sparse.intervals import Array, mean_interval, t_quantile
+from sb3_sparse.pages.numbers import counted
 from sb3_sparse.report.backend import rliable_library
 
 REPS, SEED, LEAST = 2000, 0, 2
@@ -77,7 +78,7 @@ def rectangle(by_task: Mapping[str, Sequence[float]], least: int = LEAST) -> Rec
     """
     full = {task: scores for task, scores in by_task.items() if len(scores) >= least}
     remarks = [
-        f"{task}: {len(by_task[task])} run(s), of {least} needed"
+        f"{task}: {counted(len(by_task[task]), 'run')}, of {least} needed"
         for task in by_task
         if task not in full
     ]
@@ -86,7 +87,8 @@ def rectangle(by_task: Mapping[str, Sequence[float]], least: int = LEAST) -> Rec
     count = min(map(len, full.values()))
     unused = {task: len(scores) - count for task, scores in full.items() if len(scores) > count}
     remarks += [
-        f"{task}: {more} run(s) of the highest seeds not used" for task, more in unused.items()
+        f"{task}: {counted(more, 'run')} of the highest seeds not used"
+        for task, more in unused.items()
     ]
     scores = np.array([list(scores)[:count] for scores in full.values()], dtype=np.float64).T
     return Rectangle(scores, tuple(full), tuple(remarks))

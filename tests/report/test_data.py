@@ -229,7 +229,7 @@ def test_mujoco_is_divided_by_the_mean_of_the_same_algorithms_dense_runs(folders
     runs, _ = read_runs(folders.made)
     normaliser = Normaliser(runs)
     assert normaliser(runs[-1]) == 1.5
-    assert any("2 dense run(s)" in text for text in normaliser.statements())
+    assert any("the mean of 2 dense runs of full size" in text for text in normaliser.statements())
 
 
 def test_a_task_without_a_scale_is_named(folders):

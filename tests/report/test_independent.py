@@ -157,7 +157,7 @@ def interval(key: str, x: np.ndarray, y: np.ndarray, seed: int) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def judged():
-    """The package's verdicts, by finding: those of the studies' reports."""
+    """The package's verdicts on these seeds, by finding."""
     archive = Archive(ARCHIVE).read()
     found = {}
     for name, keys in (
@@ -165,7 +165,9 @@ def judged():
         ("noise", ("noise",)),
     ):
         statuses = [
-            status_of(cell, Path("nowhere"), archive) for cell in Study.read(name, "small").cells
+            status_of(cell, Path("nowhere"), archive)
+            for cell in Study.read(name, "small").cells
+            if cell.run.seed in SEEDS
         ]
         runs, out = read_runs([], {one.folder.path: one.archived for one in statuses})
         assert (len(runs), out) == (len(statuses), [])

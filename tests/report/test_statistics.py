@@ -120,5 +120,5 @@ def test_a_rectangle_takes_the_lowest_seeds_and_says_what_it_leaves_out():
     made = rectangle({"a": [1.0, 2.0, 3.0], "b": [4.0, 5.0], "c": [6.0]})
     assert made.scores.tolist() == [[1.0, 4.0], [2.0, 5.0]]
     assert made.tasks == ("a", "b")
-    assert made.remarks == ("c: 1 run(s), of 2 needed", "a: 1 run(s) of the highest seeds not used")
+    assert made.remarks == ("c: 1 run, of 2 needed", "a: 1 run of the highest seeds not used")
     assert rectangle({"c": [6.0]}) is None
