@@ -210,7 +210,9 @@ def test_mistakes_are_one_line_and_make_nothing(args, message, tmp_path, mistake
 
 
 def test_enjoy_of_what_is_no_run(mistake):
-    assert "there is no file nowhere; give a model saved by SB3" in mistake("enjoy", "nowhere")
+    assert "there is no run and no model nowhere; give a run's folder" in mistake(
+        "enjoy", "nowhere"
+    )
 
 
 @pytest.mark.parametrize(

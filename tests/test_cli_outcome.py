@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -80,7 +81,17 @@ def test_a_run_without_evaluations_says_that_it_has_no_curve(trained, capsys):
         lines = lines_of(trained[0], capsys)
     finally:
         (trained[0].folder / "kept.npz").rename(trained[0].folder / "evaluations.npz")
-    assert any(line.startswith("No learning curve: the run was too short") for line in lines)
+    (why,) = (line for line in lines if line.startswith("No learning curve, no best policy:"))
+    assert "--eval-freq" in why
+
+
+@pytest.mark.parametrize(("last", "best", "named"), [(-5.0, -4.0, True), (-4.0, -5.0, False)])
+def test_the_commands_take_the_policy_with_the_greater_return(trained, capsys, last, best, named):
+    found, _ = trained
+    of_last, of_best = found.results
+    results = (replace(of_last, mean_return=last), replace(of_best, mean_return=best))
+    lines = lines_of(replace(found, results=results), capsys)
+    assert [" --best" in line for line in lines[-3:]] == [named, named, False]
 
 
 def test_large_policies_are_not_compiled(trained, capsys, monkeypatch):

@@ -35,7 +35,7 @@ def tell(outcome: Outcome) -> None:
         )
     _tell_costs(outcome)
     _tell_curve(outcome)
-    best = ["--best"] if len(results) > 1 else []
+    best = ["--best"] if results[-1].mean_return > results[0].mean_return else []
     say("Next, look at it, deploy it, or compare methods:")
     say(command("enjoy", outcome.folder, *best))
     say(command("export", outcome.folder, *best, "--to", "c", "policy.c"))
@@ -88,7 +88,10 @@ def _tell_curve(outcome: Outcome) -> None:
         say(f"No learning curve: {_reason(error)}")
         return
     if drawn is None:
-        say("No learning curve: the run was too short for an evaluation during training")
+        say(
+            "No learning curve, no best policy: no evaluation was due during training. Train "
+            "longer (-n), or evaluate more often (--eval-freq)."
+        )
     else:
         say(f"Learning curve: {drawn}")
 

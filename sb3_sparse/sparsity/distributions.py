@@ -30,8 +30,10 @@ def check_sparsity(sparsity: float, what: str = "sparsity") -> float:
     if not is_number(sparsity):
         raise ConfigError(f"{what} must be a number in [0, 1), got {sparsity!r}")
     if not 0.0 <= sparsity < 1.0:
+        percent = f"; {sparsity:g} % is {sparsity / 100:g}" if 10 <= sparsity < 100 else ""
         raise ConfigError(
-            f"{what} must lie in [0, 1) (it is the removed fraction of connections), got {sparsity}"
+            f"{what} must lie in [0, 1) (it is the removed fraction of connections), got "
+            f"{sparsity}{percent}"
         )
     return as_float(sparsity)
 

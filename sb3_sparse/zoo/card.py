@@ -192,6 +192,9 @@ class Card:
             command("inspect", local, *best),
         ]
         yield "## Load\n"
+        if self.spec.gym_packages:
+            modules = " and ".join(f"`{name}`" for name in self.spec.gym_packages)
+            yield f"Python must find {modules}, which this run imported for its own classes.\n"
         yield from _fenced("sh", lines)
         yield "In Python, with the environment's wrappers and normalisation:\n"
         chosen = ", best=True" if self.best else ""

@@ -136,8 +136,8 @@ def known_environment(env_id: str) -> None:
         raise ConfigError(
             f"unknown environment {env_id!r}"
             + (did_you_mean(env_id, gym.registry) or "; give a Gymnasium id")
-            + "; --gym-packages names a module that registers your own environments"
-            + ("" if register_atari() else " (Atari games need sb3-sparse[atari])")
+            + "; one of your own is module:Id, e.g. my_envs:Maze-v0, or --gym-packages names its "
+            "module" + ("" if register_atari() else " (Atari games need sb3-sparse[atari])")
         )
 
 

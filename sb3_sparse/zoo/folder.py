@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sb3_sparse.errors import ConfigError
+from sb3_sparse.errors import ConfigError, did_you_mean
 from sb3_sparse.files import written_whole
 from sb3_sparse.loading.text import read_json
 from sb3_sparse.zoo.lock import is_locked, locked
@@ -248,6 +248,12 @@ def locate(path: Path | str, best: bool = False) -> tuple[Path, RunFolder]:
     path = Path(path)
     if not RunFolder(path).is_run:  # a run may have a folder that is named like its zip
         path = _zip_path(path)
+    if not path.suffix and not path.exists():
+        near = did_you_mean(path.name, (one.name for one in path.parent.glob("*")))
+        raise ConfigError(
+            f"there is no run and no model {path}{near}; give a run's folder, e.g. {EXAMPLE}, or a "
+            "model saved by SB3, e.g. model.zip"
+        )
     if not path.is_dir():
         return path, RunFolder(path.parent)
     folder = RunFolder(path)

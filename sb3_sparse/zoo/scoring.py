@@ -91,7 +91,15 @@ def enjoy(
         raise MissingExtra("recording a video", "video")
     set_random_seed(seed)
     kwargs: dict[str, Any] = {"render_mode": "rgb_array"} if video else {}
-    env = saved.envs(1, seed, env_kwargs=kwargs)
+    try:
+        env = saved.envs(1, seed, env_kwargs=kwargs)
+    except ConfigError as error:
+        if not video:
+            raise
+        raise ConfigError(
+            f"{error}. For a video its constructor must take render_mode='rgb_array', and its "
+            "render() return images"
+        ) from error
     folder = saved.path.parent / "videos"
     try:
         model = saved.load()

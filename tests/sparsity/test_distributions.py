@@ -213,6 +213,13 @@ def test_error_names_the_argument_and_the_value():
         check_sparsity(1.25, "initial_sparsity")
 
 
+def test_a_percentage_is_told_its_fraction():
+    with pytest.raises(ConfigError, match=r"got 90; 90 % is 0\.9$"):
+        check_sparsity(90)
+    with pytest.raises(ConfigError, match=r"got 99\.5; 99\.5 % is 0\.995$"):
+        check_sparsity(99.5)
+
+
 @pytest.mark.parametrize(("value", "expected"), [(0, 0.0), (0.0, 0.0), (0.9, 0.9), (0.999, 0.999)])
 def test_sparsity_within_its_range_is_returned_as_a_float(value, expected):
     checked = check_sparsity(value)

@@ -23,6 +23,7 @@ from sb3_sparse.studies import Study, run_study, status_of
 from sb3_sparse.tuning import tune
 from sb3_sparse.tuning.backend import optuna
 from sb3_sparse.tuning.spaces import Space
+from sb3_sparse.zoo.card import Card
 from sb3_sparse.zoo.environments import import_packages, plain_id
 from sb3_sparse.zoo.folder import RunFolder
 from sb3_sparse.zoo.inspection import inspect_model
@@ -38,8 +39,13 @@ from gymnasium.envs.classic_control import CartPoleEnv
 class Tiny(CartPoleEnv):
     pass
 
+class Blind(CartPoleEnv):
+    def __init__(self):
+        super().__init__()
+
 for name in ("Tiny-v0", "ours/Tiny-v0"):
     gym.register(name, entry_point="tiny_envs:Tiny", max_episode_steps=20)
+gym.register("Blind-v0", entry_point="tiny_envs:Blind", max_episode_steps=20)
 """
 SHORT = dict(
     n_timesteps=200,
@@ -52,7 +58,7 @@ SHORT = dict(
 def forget() -> None:
     """As in a new process: the package was never imported."""
     sys.modules.pop("tiny_envs", None)
-    for name in ("Tiny-v0", "ours/Tiny-v0"):
+    for name in ("Tiny-v0", "ours/Tiny-v0", "Blind-v0"):
         gym.registry.pop(name, None)
 
 
@@ -86,6 +92,16 @@ def test_a_run_remembers_the_package_and_lies_in_a_folder_of_the_plain_id(traine
     assert (trained / "Tiny-v0.zip").is_file()
     arguments = RunFolder(trained).arguments()
     assert (arguments["env"], arguments["gym_packages"]) == ("Tiny-v0", ["tiny_envs"])
+
+
+def test_a_card_names_the_package_that_its_readers_need(trained):
+    assert "Python must find `tiny_envs`" in str(Card.of(trained))
+
+
+def test_an_environment_that_does_not_render_is_not_filmed_and_what_it_lacks_is_said(trained):
+    with pytest.raises(ConfigError, match=r"For a video .* take render_mode='rgb_array'"):
+        enjoy(trained, env_id="tiny_envs:Blind-v0", episodes=1, video=True)
+    assert enjoy(trained, env_id="tiny_envs:Blind-v0", episodes=1).episodes == 1
 
 
 @pytest.mark.parametrize(
@@ -224,7 +240,7 @@ def test_studies_name_it_too(named, package, tmp_path):
         ("tiny_envs:", "is neither an id nor package:Id"),
         ("tiny_envs:a:b", "is neither an id nor package:Id"),
         ("tiny_envs:Tinny-v0", "unknown environment 'Tinny-v0'.*did you mean 'Tiny-v0'"),
-        ("Tiny-v0", "unknown environment 'Tiny-v0'.*--gym-packages names a module"),
+        ("Tiny-v0", "unknown environment 'Tiny-v0'.*your own is module:Id.* --gym-packages names"),
     ],
 )
 def test_what_is_wrong_with_a_package_is_said(env_id, message, package):
