@@ -156,3 +156,4 @@ class MissingKernels(SparsityError, ImportError):
             f"sparse storage needs compiled kernels: {reason}. Reinstall sb3-sparse on a "
             "machine with a C compiler (gcc or clang), or use compute='masked'"
         )
+        self.reason = reason

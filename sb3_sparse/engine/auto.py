@@ -22,6 +22,7 @@ from sb3_sparse.engine.optimizers import acts_elementwise
 from sb3_sparse.engine.paths import is_sequence
 from sb3_sparse.engine.sequential import ELEMENTWISE
 from sb3_sparse.engine.storage import LayerStorage
+from sb3_sparse.errors import warn
 
 LARGE = 2**13
 """Size of a layer below which overhead dominates."""
@@ -64,6 +65,13 @@ class AutoCompute:
         )
         if not here or not all(acts_elementwise(optimizer) for optimizer in optimizers):
             return []
+        missing = why_missing()
+        if missing is not None and any(layer.nnz < layer.size for layer in layers):
+            warn(
+                f"there are no compiled kernels: {missing}. Training and acting take several times "
+                "as long. Reinstall sb3-sparse where there is a C compiler (gcc or clang), or give "
+                "compute='masked' if this is meant"
+            )
         return choose(root, layers, self.allowed)
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from sb3_sparse.engine.native import library
-from sb3_sparse.errors import ConfigError, MissingKernels, SparsityError
+from sb3_sparse.errors import ConfigError, MissingKernels, SparsityError, SparsityWarning
 
 ROOT = Path(__file__).parents[2]
 SOURCES = ROOT / "sb3_sparse" / "engine" / "native"
@@ -52,8 +52,16 @@ def test_sparse_without_kernels_is_an_error_and_auto_trains_with_masks(relocated
 
     with pytest.raises(MissingKernels, match="or use compute='masked'"):
         make("SAC", policy_kwargs=dict(compute="sparse"))
-    model = make("SAC", policy_kwargs=dict(compute="auto", net_arch=[200, 200])).learn(23)
+    with pytest.warns(SparsityWarning, match="no compiled kernels: .* several times as long"):
+        model = make("SAC", policy_kwargs=dict(compute="auto", net_arch=[200, 200])).learn(23)
     assert not any(layer.is_sparse for layer in model.policy.sparse.layers)
+
+
+def test_without_kernels_masks_that_were_asked_for_are_no_surprise(relocated, recwarn):
+    from support import make
+
+    make("SAC", policy_kwargs=dict(compute="masked"))
+    assert not [one for one in recwarn if issubclass(one.category, SparsityWarning)]
 
 
 def test_a_damaged_library_does_not_load(relocated):

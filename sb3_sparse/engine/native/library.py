@@ -136,7 +136,7 @@ def why_missing() -> str | None:
     try:
         library()
     except MissingKernels as error:
-        return str(error)
+        return error.reason
     return None
 
 
