@@ -77,6 +77,19 @@ def test_environments_add_up_and_guesses_are_told(told):
     assert not any("Findings" in line for line in lines)
 
 
+def test_a_task_without_a_scale_is_named_with_the_cure(told):
+    common = {"algo": "sac", "env_id": ["MountainCarContinuous-v0"]}
+    (line,) = [line for line in told(APART, common=common) if line.startswith("No scale")]
+    assert "SAC on classic control, MountainCarContinuous-v0: no run of the dense network" in line
+    assert line.endswith(
+        "reference_returns in a study's file (docs/studies.md) give a task a scale"
+    )
+    given = {"MountainCarContinuous-v0": [0, 500]}
+    lines = told(APART, common=common, reference_returns=given)
+    assert not any(line.startswith("No scale") for line in lines)
+    assert "supported" in finding(lines)
+
+
 def test_without_a_timed_run_the_cost_is_unknown(told):
     lines = told({"set": (), "dense": ()})
     unknown = "left 10 runs, core hours unknown; no run of DQN has been timed yet"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from sb3_sparse.errors import MissingExtra
@@ -35,7 +35,10 @@ def costs_of(statuses: Sequence[CellStatus], costs: Costs) -> Iterator[str]:
 
 
 def findings_of(
-    statuses: Sequence[CellStatus], costs: Costs, findings: tuple[str, ...] | None
+    statuses: Sequence[CellStatus],
+    costs: Costs,
+    findings: tuple[str, ...] | None,
+    references: Mapping[str, tuple[float, float]],
 ) -> Iterator[str]:
     """Yield a line for each finding that a study tests and on which its done cells have data.
 
@@ -43,19 +46,23 @@ def findings_of(
     one line that names it.
 
     :param findings: keys of the findings; None for all of the paper
+    :param references: the returns that become 0 and 1, by environment
     """
     if not any(one.state is CellState.DONE for one in statuses):
         return
     try:
         from sb3_sparse.report import Results, judge, read_runs
+        from sb3_sparse.report.normalisation import CURE
     except MissingExtra as error:
         yield f"No verdicts: {error}"
         return
     runs, _ = read_runs(*readable(statuses))
-    results = Results(tuple(runs), findings=findings)
+    results = Results(tuple(runs), findings=findings, references=references)
     verdicts = [one for one in judge(results) if one.has_data]
     if verdicts:
         yield "Findings of the paper on which there are data:"
+    for task in results.normaliser.missing:
+        yield f"No scale: {task}; {CURE}"
     for one in verdicts:
         family = f", {one.family}" if len(results.families()) > 1 else ""
         yield f"  {one.finding.key}{family}: {_told(one)}{_needed(one, results, statuses, costs)}"

@@ -137,7 +137,7 @@ def status(
             say(f"diverged: {one.cell.name}, at step {one.steps}")
         if one.state is CellState.FAILED:
             say(f"failed: {one.cell.name}; {one.why(store)}")
-    for line in findings_of(statuses, costs, study.findings):
+    for line in findings_of(statuses, costs, study.findings, study.references):
         say(line)
 
 
@@ -174,6 +174,7 @@ def report(
         varies=study.varies,
         command="\n".join((asked.command("run"), asked.command("report"))),
         archived=archived,
+        references=study.references,
         pending=[_pending(one, store) for one in statuses if not one.state.is_over],
     )
     say(f"Written: {page}")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from statistics import fmean
 
@@ -51,6 +51,9 @@ CONTROL_RETURNS = {
 }
 SUITE_RETURNS = {DM_CONTROL: (0.0, 1000.0)}
 ANY = (-math.inf, math.inf)
+References = Mapping[str, tuple[float, float]]
+"""The returns that become 0 and 1, by task: e.g. of a random policy, and of one that solves it."""
+CURE = "reference_returns in a study's file (docs/studies.md) give a task a scale"
 PAIRS = {
     **{name: (*pair, "human-normalised, Mnih et al. 2015") for name, pair in HUMAN.items()},
     **{name: (*pair, "random policy to solved") for name, pair in CONTROL_SCALE.items()},
@@ -83,15 +86,16 @@ class Normaliser:
     """The scales of all families and tasks that have one.
 
     :param runs: where no scale is fixed, the dense runs of full size among them give it
+    :param references: returns that fix the scale of tasks, before all others
     """
 
-    def __init__(self, runs: Iterable[RunData]) -> None:
+    def __init__(self, runs: Iterable[RunData], references: References | None = None) -> None:
         self.scales: dict[tuple[str, str], Scale] = {}
         self.missing: list[str] = []
         trained = [run for run in runs if run.trained]
         for family, env_id in sorted({(run.family, run.env_id) for run in trained}):
             here = [run for run in trained if (run.family, run.env_id) == (family, env_id)]
-            scale = _fixed(env_id) or _by_dense(here)
+            scale = _given(env_id, references or {}) or _fixed(env_id) or _by_dense(here)
             if isinstance(scale, Scale):
                 self.scales[family, env_id] = scale
             else:
@@ -117,6 +121,11 @@ class Normaliser:
             f"({scale.source})"
             for (family, env_id), scale in self.scales.items()
         ]
+
+
+def _given(env_id: str, references: References) -> Scale | None:
+    pair = references.get(env_id)
+    return None if pair is None else Scale(*pair, "reference_returns of the study")
 
 
 def _fixed(env_id: str) -> Scale | None:

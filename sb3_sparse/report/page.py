@@ -13,6 +13,7 @@ from sb3_sparse.report.figures import FIGURES
 from sb3_sparse.report.findings import FINDINGS
 from sb3_sparse.report.leads import leads
 from sb3_sparse.report.methods import percent
+from sb3_sparse.report.normalisation import CURE
 from sb3_sparse.report.results import Results
 from sb3_sparse.report.summary import scores
 from sb3_sparse.report.tables import findings_table
@@ -42,11 +43,15 @@ INTERVALS = (
     '"Not enough data" is also the verdict if the interval decides nothing; then "seeds needed" '
     "is how many of each side would probably decide it, if the effect stays as it is."
 )
+UNSCALED = (
+    "Tasks without a scale count for no finding but the one on signal-to-noise ratios, and are in "
+    "no figure of normalised scores"
+)
 SCALES = (
-    "Scales: Atari by random play and human testers of Mnih et al. 2015; classic control "
-    "from a uniformly random policy, measured with Gymnasium 1.4, to Gymnasium's reward "
-    "threshold (Pendulum, which has none: -150); MuJoCo and all else divided by the mean "
-    "score of the dense network of full size of the same algorithm."
+    "Scales: by reference_returns, where the study gives them; Atari by random play and human "
+    "testers of Mnih et al. 2015; classic control from a uniformly random policy, measured with "
+    "Gymnasium 1.4, to Gymnasium's reward threshold (Pendulum, which has none: -150); MuJoCo and "
+    "all else divided by the mean score of the dense network of full size of the same algorithm."
 )
 
 
@@ -147,8 +152,12 @@ def _findings(content: Content) -> html.Section:
     parts = [html.paragraph(f"The findings are those of {PAPER}.")]
     if tested:
         parts += _shortened(findings_table(tested), "verdict")
+    missing = content.results.normaliser.missing
+    if missing:
+        parts += [html.paragraph(f"{UNSCALED}; {CURE}:"), html.listing(missing)]
     if silent:
-        parts.append(html.paragraph("These runs have no data on:"))
+        scaled = ", or none on a scale," if missing else ""
+        parts.append(html.paragraph(f"These runs have no data{scaled} on:"))
         parts.append(html.listing(silent))
     asked = {one.finding.key for one in content.verdicts}
     rules = [
@@ -236,9 +245,6 @@ def _settings(results: Results) -> html.Section:
     parts = [html.listing(_trained(results)), html.paragraph(HOW)]
     if results.normaliser.scales:
         parts.append(html.listing(results.normaliser.statements()))
-    if results.normaliser.missing:
-        parts.append(html.paragraph("Without a scale, so in no figure of normalised scores:"))
-        parts.append(html.listing(results.normaliser.missing))
     parts.append(html.paragraph(SCALES))
     versions = "; ".join(_versions(results)) or "none recorded"
     return html.section("Settings", *parts, html.paragraph(f"Versions: {versions}."))

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 from sb3_sparse.errors import SparsityError
 from sb3_sparse.pages.numbers import counted
 from sb3_sparse.report.data import RunData
 from sb3_sparse.report.methods import DENSE, in_order
-from sb3_sparse.report.normalisation import Normaliser
+from sb3_sparse.report.normalisation import Normaliser, References
 from sb3_sparse.zoo.spec import algorithms
 
 Cell = tuple[str, str, str, float]
@@ -28,6 +28,7 @@ class Results:
     :param runs: as :func:`read_runs` returns them
     :param varies: name of the setting that was varied, for the figure ``"sensitivity"``
     :param findings: keys of the findings of the paper to judge; None for all
+    :param references: the returns that become 0 and 1 by task; the others have scales of their own
 
     Example::
 
@@ -42,6 +43,7 @@ class Results:
     runs: tuple[RunData, ...]
     varies: str | None = None
     findings: tuple[str, ...] | None = None
+    references: References = field(default_factory=dict, hash=False)
 
     @cached_property
     def trained(self) -> list[RunData]:
@@ -64,8 +66,8 @@ class Results:
 
     @cached_property
     def normaliser(self) -> Normaliser:
-        """The scales, which only the dense runs among the main runs can set."""
-        return Normaliser(self.main)
+        """The scales; of the runs, only the dense ones among the main runs can set one."""
+        return Normaliser(self.main, self.references)
 
     def families(self) -> list[str]:
         """Return the families (algorithm, architecture and suite) of the trained runs."""

@@ -108,7 +108,8 @@ def _judged(results: Results) -> tuple[Verdict, ...]:
         given = [(family, finding.sides(results, family)) for family in results.families()]
         known = [(family, sides) for family, sides in given if sides.x]
         if not known:
-            why = "; ".join(dict.fromkeys(sides.why for _, sides in given)) or "no trained run"
+            whys = [*dict.fromkeys(sides.why for _, sides in given)] or ["no trained run"]
+            why = "; ".join([*whys, *(f"no scale: {one}" for one in results.normaliser.missing)])
             found.append(Verdict(finding, "", UNDECIDED, remark=why))
         found += [_verdict(finding, family, sides) for family, sides in known]
     return tuple(found)

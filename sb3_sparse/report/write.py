@@ -9,6 +9,7 @@ from sb3_sparse.errors import ConfigError
 from sb3_sparse.files import write_csv, written_whole
 from sb3_sparse.pages.plot import save
 from sb3_sparse.report.figures import NotEnoughData, check_figures, draw
+from sb3_sparse.report.normalisation import References
 from sb3_sparse.report.page import CSV_FILES, Content, Shown, render
 from sb3_sparse.report.reading import read_runs
 from sb3_sparse.report.results import Results
@@ -30,6 +31,7 @@ def write_report(
     command: str = "",
     pending: Sequence[str] = (),
     archived: Mapping[Path, Archived] | None = None,
+    references: References | None = None,
 ) -> Path:
     """Write a report on run folders and archived runs.
 
@@ -47,6 +49,8 @@ def write_report(
     :param command: the command that continues what is pending
     :param pending: cells that are planned and not done
     :param archived: runs by the folder that they have or had, as in :func:`read_runs`
+    :param references: the returns of a task that become 0 and 1 where scores are normalised, e.g.
+        ``{"Maze-v0": (-500.0, -60.0)}``; None: those of known tasks, else the dense runs' mean is 1
     :return: the page
     :raises ConfigError: for an unknown figure, or if ``out`` is not a folder
     """
@@ -55,7 +59,8 @@ def write_report(
     if out.exists() and not out.is_dir():
         raise ConfigError(f"the report goes into a folder, and {out} is a file; give another name")
     runs, left_out = read_runs(folders, archived)
-    results = Results(tuple(runs), varies, None if findings is None else tuple(findings))
+    asked = None if findings is None else tuple(findings)
+    results = Results(tuple(runs), varies, asked, references or {})
     found = judge(results)
     out.mkdir(parents=True, exist_ok=True)
     shown = [_figure(name, results, out / FOLDER) for name in dict.fromkeys(figures)]

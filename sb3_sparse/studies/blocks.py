@@ -16,7 +16,11 @@ from sb3_sparse.zoo.spec import RunSpec
 SHIPPED = Path(__file__).parent / "shipped"
 SCALES = ("smoke", "small", "medium", "paper")
 """Scales of shipped studies; only some studies have ``medium``."""
-KEYS = {"title", "figures", "findings", "varies", "common", "runs", "scales", "measures", "trained"}
+REFERENCES = "reference_returns"
+KEYS = {
+    "title", "figures", "findings", "varies", "common", "runs", "scales", "measures", "trained",
+    REFERENCES,
+}  # fmt: skip
 RUN_KEYS = {one.name for one in fields(RunSpec)} - {"seed", "device", "entry"}
 CHOSEN = ("sparsity", "match_params", "method", "distribution", "algo")
 """Keys whose values a scale selects from a block's."""

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from sb3_sparse.errors import ConfigError, did_you_mean
 from sb3_sparse.policies.arguments import arguments_of
-from sb3_sparse.sparsity.numeric import is_whole
+from sb3_sparse.sparsity.numeric import is_number, is_whole
 from sb3_sparse.studies.blocks import (
     CHOSEN,
     KEYS,
     MEASURES,
     PACKAGES,
+    REFERENCES,
     RUN_KEYS,
     SCHEDULE,
     SEEDS,
@@ -31,7 +33,7 @@ from sb3_sparse.studies.cell import Cell
 from sb3_sparse.studies.measures import Measures
 from sb3_sparse.topology import method_named, method_names
 from sb3_sparse.zoo.configs import read_yaml
-from sb3_sparse.zoo.environments import package_names
+from sb3_sparse.zoo.environments import package_names, plain_id
 from sb3_sparse.zoo.names import Names
 from sb3_sparse.zoo.spec import RunSpec
 
@@ -54,6 +56,7 @@ class Study:
     :param varies: the setting that the study varies; None: only method and sparsity
     :param cells: the cells to train, first seeds first
     :param findings: keys of the findings of the paper that it tests; None: all on which it has data
+    :param references: the returns that become 0 and 1 on its page, by environment
     :param merged: names of cells that the file has more than once; they are trained once
     """
 
@@ -65,6 +68,7 @@ class Study:
     cells: tuple[Cell, ...]
     merged: tuple[str, ...] = ()
     findings: tuple[str, ...] | None = None
+    references: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     @classmethod
     def read(cls, what: str, scale: str, gym_packages: Sequence[str] = ()) -> Study:
@@ -111,7 +115,8 @@ class Study:
         title, varies = str(content["title"]), content.get("varies")
         _check_varies(varies, cells, path)
         tested = None if findings is None else tuple(findings)
-        return cls(path.stem, scale, title, tuple(figures), varies, cells, merged, tested)
+        returns = _references(content.get(REFERENCES, {}), path)
+        return cls(path.stem, scale, title, tuple(figures), varies, cells, merged, tested, returns)
 
     @property
     def report_folder(self) -> Path:
@@ -165,6 +170,27 @@ def _check_varies(varies: Any, cells: Sequence[Cell], path: Path) -> None:
             f"{path}: varies must be the name of a setting, e.g. batch_size, got {varies!r}"
             f"{did_you_mean(varies, known)}"
         )
+
+
+def _references(given: Any, path: Path) -> dict[str, tuple[float, float]]:
+    """Read the returns that become 0 and 1, by environment."""
+    if not isinstance(given, Mapping):
+        raise ConfigError(f"{path}: {REFERENCES} must map environments to pairs, got {given!r}")
+    found = {}
+    for name, pair in given.items():
+        env_id, _ = plain_id(str(name))
+        if (
+            not isinstance(pair, list)
+            or len(pair) != 2
+            or not all(is_number(one) and math.isfinite(one) for one in pair)
+            or pair[0] >= pair[1]
+        ):
+            raise ConfigError(
+                f"{path}: {REFERENCES} of {name} must be two returns, of which the second is the "
+                f"greater, e.g. [-500, -60], got {pair!r}"
+            )
+        found[env_id] = (float(pair[0]), float(pair[1]))
+    return found
 
 
 def _check_schedule(schedule: Mapping[str, Any]) -> None:

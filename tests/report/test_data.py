@@ -242,6 +242,19 @@ def test_a_task_without_a_scale_is_named(folders):
     assert "-5" in normaliser.missing[1]
 
 
+def test_returns_that_are_given_fix_the_scale_of_a_task_before_all_others(folders):
+    folders.add("rigl", 0.9, 0, -300.0, env_id="Maze-v0")
+    folders.add("dense", None, 0, -200.0, env_id="Maze-v0")
+    folders.add("rigl", 0.9, 0, 150.0, env_id="CartPole-v1")
+    runs, _ = read_runs(folders.made)
+    normaliser = Normaliser(runs, {"Maze-v0": (-500.0, -100.0), "CartPole-v1": (50.0, 250.0)})
+    assert [normaliser(run) for run in runs] == [0.5, 0.75, 0.5]
+    assert not normaliser.missing
+    assert "DQN on other tasks, Maze-v0: 0 is -500, 1 is -100 (reference_returns of the study)" in (
+        normaliser.statements()
+    )
+
+
 def test_a_damaged_model_is_named_by_the_figure_of_masks(folders):
     from sb3_sparse.report.figures import NotEnoughData, draw
 

@@ -49,6 +49,26 @@ def report(study_folders, tmp_path_factory):
     )  # fmt: skip
 
 
+def test_the_page_says_which_tasks_have_no_scale_and_how_to_give_one(folders, tmp_path):
+    for seed in range(3):
+        folders.add("rigl", 0.9, seed, -300.0, env_id="Maze-v0")
+        folders.add("dense", None, seed, -200.0, env_id="Maze-v0")
+    page, given = (
+        write_report(folders.made, tmp_path / name, title="Maze", figures=["curves"], **more)
+        for name, more in (("a", {}), ("b", {"references": {"Maze-v0": (-500.0, -100.0)}}))
+    )
+    assert re.search(
+        "Tasks without a scale .*reference_returns in a study.*score is -200, by",
+        page.read_text(),
+        re.DOTALL,
+    )
+    assert "These runs have no data, or none on a scale, on:" in page.read_text()
+    text = given.read_text()
+    assert "Tasks without a scale" not in text
+    assert "Maze-v0: 0 is -500, 1 is -100 (reference_returns of the study)" in text
+    assert "contradicted" in text
+
+
 @pytest.mark.parametrize("name", list(TABLE))
 def test_each_figure_is_drawn_and_has_its_numbers(report, name):
     folder = report.parent / "figures"

@@ -101,6 +101,21 @@ def test_without_runs_each_finding_says_what_is_missing(folders, finding):
     assert found.remark
 
 
+def test_a_task_of_negative_returns_counts_once_it_has_a_scale(folders):
+    for method in ("rigl", "set"):
+        seeds(folders, 4, -300.0, method=method, env_id="Maze-v0")
+    seeds(folders, 4, -200.0, **DENSE, env_id="Maze-v0")
+    without = verdict(folders, "rigl-set")
+    assert (without.verdict, without.has_data) == (UNDECIDED, False)
+    assert "no scale: DQN on other tasks, Maze-v0: the dense network's mean" in without.remark
+    runs, _ = read_runs(folders.made)
+    results = Results(tuple(runs), references={"Maze-v0": (-500.0, -100.0)})
+    found = {one.finding.key: one for one in judge(results)}
+    assert found["rigl-set"].verdict == SUPPORTED
+    assert found["no-loss"].verdict == CONTRADICTED
+    assert found["no-loss"].effect == pytest.approx(-100 / 400)
+
+
 def test_equal_scores_support_that_rigl_is_as_good_as_set(folders):
     pair("rigl-set", 400.0, 400.0, folders, 5)
     assert verdict(folders, "rigl-set").verdict == SUPPORTED

@@ -35,6 +35,23 @@ def test_every_combination_of_the_lists_is_a_cell_once_a_seed(tmp_path):
     assert {r.n_timesteps for r in runs} == {100}
 
 
+def test_reference_returns_are_pairs_by_environment(tmp_path):
+    assert read(tmp_path).references == {}
+    given = {"Acrobot-v1": [-500, -80], "my_envs:Maze-v0": [0, 1.5]}
+    study = read(tmp_path, reference_returns=given)
+    assert study.references == {"Acrobot-v1": (-500.0, -80.0), "Maze-v0": (0.0, 1.5)}
+    assert [one.address for one in study.cells] == [one.address for one in read(tmp_path).cells]
+
+
+@pytest.mark.parametrize(
+    "given",
+    [[-500, -80], {"Maze-v0": -80}, {"Maze-v0": [-80, -500]}, {"Maze-v0": [0, float("inf")]}],
+)
+def test_reference_returns_that_are_no_scale_are_rejected(tmp_path, given):
+    with pytest.raises(ConfigError, match=r"reference_returns .*must .*got"):
+        read(tmp_path, reference_returns=given)
+
+
 def test_first_seeds_come_first(tmp_path):
     seeds = [cell.run.seed for cell in read(tmp_path).cells]
     assert seeds == sorted(seeds)
