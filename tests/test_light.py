@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 from importlib import import_module
+from importlib.metadata import version
 from pathlib import Path
 from pkgutil import iter_modules
 
@@ -37,6 +38,7 @@ finally:
     ("args", "said"),
     [
         (["--help"], "Sparse training inside"),
+        (["--version"], f"sb3-sparse {version('sb3-sparse')}"),
         (["train", "--help"], "--sparsity"),
         (["tune", "--help"], "--trials"),
         (["study", "list"], "classic_control"),
@@ -89,6 +91,7 @@ def test_packages_of_environments_find_the_policies_registered_in_a_command(tmp_
 EVERYTHING = """
 import json, logging, os, pkgutil, signal, sys, types, warnings
 from importlib import import_module
+from importlib.metadata import version
 import gymnasium, matplotlib, numpy, optuna, pandas, rl_zoo3.enjoy, rl_zoo3.train, sb3_contrib
 import stable_baselines3, torch, ale_py, mujoco, onnx, ray, ruamel.yaml, tensorboard
 import rliable.library, scipy.stats, moviepy, yaml, onnxruntime, psycopg, sqlalchemy, typer, rich

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import sys
 import warnings
-from typing import Any
+from importlib.metadata import version
+from typing import Annotated, Any
 
 from sb3_sparse.errors import MissingExtra, SparsityError, SparsityWarning
 
@@ -13,6 +14,7 @@ try:
     from rich.console import Console
 
     from sb3_sparse.cli.card import card_command
+    from sb3_sparse.cli.common import say
     from sb3_sparse.cli.compress import compress_command
     from sb3_sparse.cli.export import ExportCommand, export_command
     from sb3_sparse.cli.look import enjoy_command, inspect_command
@@ -28,8 +30,25 @@ app = typer.Typer(
     add_completion=False,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
-    help="Sparse training inside Stable-Baselines3.",
 )
+
+
+def _show_version(asked: bool) -> None:
+    if asked:
+        say(f"sb3-sparse {version('sb3-sparse')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _general(
+    version: Annotated[
+        bool,
+        typer.Option("--version", help="Show the version.", callback=_show_version, is_eager=True),
+    ] = False,
+) -> None:
+    """Sparse training inside Stable-Baselines3."""
+
+
 app.command("train", context_settings=MORE_VALUES)(train_command)
 app.command("enjoy")(enjoy_command)
 app.command("inspect")(inspect_command)

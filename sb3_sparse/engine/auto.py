@@ -68,7 +68,7 @@ class AutoCompute:
         missing = why_missing()
         if missing is not None and any(layer.nnz < layer.size for layer in layers):
             warn(
-                f"there are no compiled kernels: {missing}. Training and acting take several times "
+                f"there are no kernels: {missing}. Training and acting take several times "
                 "as long. Reinstall sb3-sparse where there is a C compiler (gcc or clang), or give "
                 "compute='masked' if this is meant"
             )

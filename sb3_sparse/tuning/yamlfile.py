@@ -15,7 +15,7 @@ try:
     from ruamel.yaml.comments import CommentedMap
     from ruamel.yaml.error import YAMLError
 except ImportError as error:
-    raise MissingExtra("writing tuned configs", "tune") from error
+    raise MissingExtra("tuning", "tune") from error
 
 INDENT = 2
 
