@@ -22,6 +22,7 @@ ANY: Within = (-math.inf, math.inf)
 LEAST_FOR_BAND = 5
 SEED, RUN, BAND = "seed", "run", "band"  # mark what belongs to a line, for the legend
 THIN, BOLD, FAINT = 0.8, 1.8, 0.5
+BAR = 6.0  # points
 MARKS = 4
 
 
@@ -86,7 +87,7 @@ def shown(ends: Ends, counts: Sequence[int], within: Within = ANY) -> Ends:
 
 
 def line(axes: Axes, x: Sequence[float], ends: Ends, look: Look, label: str) -> None:
-    """Draw a mean with its interval as a band, or without a band if there is no interval.
+    """Draw a mean with its intervals as a band, and as a bar where a point stands alone.
 
     :param label: text of the legend; empty for none
     """
@@ -95,8 +96,16 @@ def line(axes: Axes, x: Sequence[float], ends: Ends, look: Look, label: str) -> 
         x, middle, color=look.color, linestyle=look.line, marker=look.marker, linewidth=BOLD,
         markevery=max(1, round(len(x) / MARKS)) if len(x) > 2 * MARKS else 1, label=label or None,
     )  # fmt: skip
-    if not np.isnan(low).all():
+    known = ~np.isnan(low)
+    if known.any():
         axes.fill_between(x, low, high, color=look.color, alpha=0.18, linewidth=0, gid=BAND)
+        padded = np.pad(known, 1)
+        alone = known & ~padded[:-2] & ~padded[2:]  # a band has no area there
+        if alone.any():
+            axes.vlines(
+                np.asarray(x)[alone], low[alone], high[alone], color=look.color, linewidth=BAR,
+                alpha=0.3, gid=BAND,
+            )  # fmt: skip
 
 
 def logarithmic(one: Axes, which: str) -> None:

@@ -6,6 +6,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
+from matplotlib.collections import LineCollection
 from matplotlib.text import Text
 from scipy import stats
 
@@ -142,16 +143,28 @@ def test_below_five_seeds_each_is_drawn_and_from_five_on_a_band(folders, tmp_pat
         assert all(len(marked(axes, SEED)) >= 4 for axes in few.figure.axes)
 
 
+def test_an_interval_beside_none_is_a_bar_as_a_band_has_no_area_there(folders):
+    for seed in range(5):
+        folders.add("rigl", 0.9, seed, 300.0 + seed)
+        folders.add("dense", None, seed, 200.0 + seed)
+    folders.add("rigl", 0.5, 0, 100.0)
+    (axes,) = draw("parameters", results_of(folders.made)).figure.axes
+    bars = [one for one in marked(axes, BAND) if isinstance(one, LineCollection)]
+    found = sorted(tuple(one.get_segments()[0][:, 1]) for one in bars)
+    half = stats.t.ppf(0.975, 4) * np.std(range(5), ddof=1) / np.sqrt(5)
+    assert found == [
+        pytest.approx((202.0 - half, 202.0 + half)),
+        pytest.approx((302.0 - half, 302.0 + half)),
+    ]
+
+
 @pytest.mark.parametrize("name", ["curves", "parameters", "noise"])
 def test_bands_end_at_the_returns_that_are_possible_and_the_numbers_do_not(folders, name):
     drawing = draw(name, many(folders, 5))
     for axes in drawing.figure.axes:
         for band in marked(axes, BAND):
-            heights = band.get_datalim(axes.transData).intervaly if hasattr(
-                band, "get_datalim"
-            ) else [band.get_y(), band.get_y() + band.get_height()]  # fmt: skip
-            assert min(heights) >= 0
-            assert max(heights) <= 500
+            low, high = band.get_datalim(axes.transData).intervaly
+            assert -1e-9 <= low <= high <= 500 + 1e-9
         low, high = axes.get_ylim()
         assert -30 <= low < high <= 530
     column = drawing.heads.index("high")

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 from statistics import fmean
 
-import numpy as np
-
-from sb3_sparse.intervals import mean_interval
 from sb3_sparse.pages.backend import Axes, NullLocator
-from sb3_sparse.pages.lines import BAND, LEAST_FOR_BAND, Within, logarithmic, points
+from sb3_sparse.pages.lines import logarithmic, points
 from sb3_sparse.pages.plot import Drawing
 from sb3_sparse.report.figures.base import figure
 from sb3_sparse.report.figures.compare import MOST_LINES, no_runs
@@ -95,7 +92,10 @@ def _panel(
             sizes.update({level: at for at, level, _ in given})
             points(one, x, scores, look_of(label), text, possible_returns(place.env_id))
             if label == DENSE:
-                _across(one, scores[0], possible_returns(place.env_id))
+                look = look_of(label)
+                one.axhline(
+                    fmean(scores[0]), color=look.color, linestyle=look.line, linewidth=REFERENCE
+                )
         for parameters, level, values in given:
             row = [place.family, place.env_id, label, level]
             grid.note_once(row, [round(parameters)], [values])
@@ -117,13 +117,3 @@ def _sparsities(one: Axes, sizes: dict[float, float]) -> None:
     above.xaxis.set_minor_locator(NullLocator())
     above.set_xticks([sizes[level] for level in kept], [percent(level)[:-2] for level in kept])
     above.spines["top"].set_visible(True)
-
-
-def _across(one: Axes, scores: list[float], within: Within) -> None:
-    """Draw the mean of the dense network across the panel, with its interval as a band."""
-    look = look_of(DENSE)
-    middle, low, high = map(float, mean_interval(scores))
-    one.axhline(middle, color=look.color, linestyle=look.line, linewidth=REFERENCE)
-    if len(scores) >= LEAST_FOR_BAND:
-        low, high = np.clip((low, high), *within)
-        one.axhspan(low, high, color=look.color, alpha=0.12, linewidth=0, gid=BAND)
