@@ -250,8 +250,9 @@ def test_returns_that_are_given_fix_the_scale_of_a_task_before_all_others(folder
     normaliser = Normaliser(runs, {"Maze-v0": (-500.0, -100.0), "CartPole-v1": (50.0, 250.0)})
     assert [normaliser(run) for run in runs] == [0.5, 0.75, 0.5]
     assert not normaliser.missing
-    assert "DQN on other tasks, Maze-v0: 0 is -500, 1 is -100 (reference_returns of the study)" in (
-        normaliser.statements()
+    assert any(
+        "Maze-v0: 0 stands for a score of -500, 1 for -100 (reference_returns" in text
+        for text in normaliser.statements()
     )
 
 

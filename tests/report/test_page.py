@@ -65,7 +65,9 @@ def test_the_page_says_which_tasks_have_no_scale_and_how_to_give_one(folders, tm
     assert "These runs have no data, or none on a scale, on:" in page.read_text()
     text = given.read_text()
     assert "Tasks without a scale" not in text
-    assert "Maze-v0: 0 is -500, 1 is -100 (reference_returns of the study)" in text
+    assert (
+        "Maze-v0: 0 stands for a score of -500, 1 for -100 (reference_returns of the study)" in text
+    )
     assert "contradicted" in text
 
 
