@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import re
 import shutil
@@ -13,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch as th
 import yaml
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
@@ -110,6 +112,30 @@ def test_a_lone_zip_needs_its_environment_and_statistics(run, tmp_path):
     )
     assert (out / "CartPole-v1" / "vecnormalize.pkl").is_file()
     assert "Return over 2" in sb3_sparse("enjoy", out, "-n", "2")
+
+
+class Interrupted(io.BytesIO):
+    """A file at whose third write Ctrl-C is pressed."""
+
+    writes = 0
+
+    def write(self, data):
+        self.writes += 1
+        if self.writes == 3:
+            raise KeyboardInterrupt
+        return super().write(data)
+
+
+def test_an_interrupt_while_torch_writes_is_one(run, monkeypatch):
+    """Torch raises a RuntimeError about the file."""
+
+    def compress(*_, **__):
+        th.save({"weight": th.zeros(500)}, Interrupted())
+
+    monkeypatch.setattr("sb3_sparse.compress.compress_model", compress)
+    done = CliRunner().invoke(app, ["compress", str(run), "--sparsity", "0.7"])
+    assert done.exit_code == 130
+    assert "Interrupted. Finished levels are kept" in done.output
 
 
 def test_an_interrupted_compression_goes_on(run):

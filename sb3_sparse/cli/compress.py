@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Annotated
 
@@ -80,7 +81,7 @@ def compress_command(
         use_few_threads(trained.observation_space)
         say(f"Compressing {saved.path} ({saved.algo.upper()} on {env_id}) into {folder}")
         folder.mkdir(parents=True, exist_ok=True)
-        with RunFolder(folder).locked():
+        with RunFolder(folder).locked(), _interruptible():
             outcome = compress_model(
                 trained,
                 evaluation,
@@ -110,6 +111,20 @@ def compress_command(
     say(command("enjoy", folder))
     say(command("inspect", outcome.path))
     say(command("export", folder, "--to", "c", "policy.c"))
+
+
+@contextmanager
+def _interruptible() -> Iterator[None]:
+    """Raise KeyboardInterrupt anew where it came while torch wrote a file.
+
+    torch then raises an error of its own about the file, which is not whole.
+    """
+    try:
+        yield
+    except RuntimeError as error:
+        if isinstance(error.__context__, KeyboardInterrupt):
+            raise KeyboardInterrupt from error
+        raise
 
 
 def _default_folder(model: Path, sparsity: float | None) -> Path:
