@@ -131,7 +131,7 @@ def resume(
             own.clear_checkpoints()
             raise ConfigError(
                 f"the run in {own} is finished; evaluate it with {command('enjoy', own)}, or "
-                "train a longer one with -n"
+                "train anew, without --resume, for more steps with -n"
             )
         if record.status is Status.DIVERGED:
             raise ConfigError(f"the run in {own} has ended: {record['error']}")
