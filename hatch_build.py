@@ -12,6 +12,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from concurrent.futures import ThreadPoolExecutor
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -67,14 +68,18 @@ def compile_kernels(source: Path, library: Path, extra: tuple[str, ...] = ()) ->
     if platform.machine().lower() in ("x86_64", "amd64"):
         variants.update(avx2=AVX2, avx512=AVX512)
     with tempfile.TemporaryDirectory(dir=library.parent) as folder:
-        objects = []
-        for (suffix, flags), name in product(variants.items(), SOURCES):
-            objects.append(str(Path(folder, f"{name}_{suffix}.o")))
+
+        def compiled(name: str, suffix: str) -> str:
+            made = str(Path(folder, f"{name}_{suffix}.o"))
             subprocess.run(
-                [*command, *FLAGS, *flags, *extra, f"-DSUFFIX={suffix}", "-c",
-                 str(source / f"{name}.c"), "-o", objects[-1]],
+                [*command, *FLAGS, *variants[suffix], *extra, f"-DSUFFIX={suffix}", "-c",
+                 str(source / f"{name}.c"), "-o", made],
                 check=True, capture_output=True, text=True,
             )  # fmt: skip
+            return made
+
+        with ThreadPoolExecutor(os.cpu_count()) as pool:  # each waits for a process of its own
+            objects = list(pool.map(compiled, *zip(*product(SOURCES, variants), strict=True)))
         made = Path(folder, library.name)
         subprocess.run(
             [*command, *FLAGS, *extra, "-shared", str(source / "dispatch.c"), *objects, "-o",

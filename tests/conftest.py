@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 import signal
 import sys
 
@@ -21,6 +22,22 @@ def instructions(request):
     library.use(request.param)
     yield request.param
     library.use(before)
+
+
+@pytest.fixture(scope="session")
+def watched_kernels(tmp_path_factory):
+    """Kernels that the address sanitizer watches; the processes of a test run share them."""
+    from building import compile_watched
+    from filelock import FileLock
+
+    folder = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        folder = folder.parent
+    path = folder / "watched.so"
+    with FileLock(folder / "watched.lock"):
+        if not path.exists():
+            compile_watched(path)
+    return path
 
 
 @pytest.fixture(autouse=True)

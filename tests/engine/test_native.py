@@ -2,31 +2,16 @@
 
 from __future__ import annotations
 
-import importlib.util
-import os
-import shutil
-import subprocess
-import sys
 import zipfile
 from pathlib import Path
 
 import pytest
+from building import NEEDS_COMPILER, built_wheel, run_watched
 
 from sb3_sparse.engine.native import library
 from sb3_sparse.errors import ConfigError, MissingKernels, SparsityError, SparsityWarning
 
 ROOT = Path(__file__).parents[2]
-SOURCES = ROOT / "sb3_sparse" / "engine" / "native"
-NEEDS_COMPILER = pytest.mark.skipif(
-    shutil.which("gcc") is None, reason="needs gcc (apt install gcc) for its address sanitizer"
-)
-
-
-def build_hook():
-    spec = importlib.util.spec_from_file_location("hatch_build", ROOT / "hatch_build.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 @pytest.fixture
@@ -93,27 +78,10 @@ def test_the_kernels_share_torchs_threads_where_torch_has_openmp():
     assert library.library().sb3_sparse_shares_threads() == 1
 
 
-def built_wheel(folder: Path, **environment: str) -> tuple[str, list[str], str]:
-    """Name and files of a wheel built in a copy of the sources, and what was said."""
-    source = folder / "source"
-    for name in ("pyproject.toml", "README.md", "LICENSE", "hatch_build.py"):
-        source.mkdir(exist_ok=True)
-        shutil.copy(ROOT / name, source)
-    shutil.copytree(ROOT / "zoo_hparams", source / "zoo_hparams")
-    shutil.copytree(ROOT / "sb3_sparse", source / "sb3_sparse")
-    done = subprocess.run(
-        [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(folder)],
-        cwd=source, env={**os.environ, **environment}, capture_output=True, text=True,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    (wheel,) = folder.glob("*.whl")
-    with zipfile.ZipFile(wheel) as archive:
-        return wheel.name, archive.namelist(), done.stdout + done.stderr
-
-
 @NEEDS_COMPILER
 def test_the_wheel_has_the_library_and_is_tied_to_no_python(tmp_path):
-    name, files, _ = built_wheel(tmp_path)
+    wheel, _ = built_wheel(tmp_path)
+    name, files = wheel.name, zipfile.ZipFile(wheel).namelist()
     assert name.split("-")[2:4] == ["py3", "none"]
     assert not name.endswith("any.whl")
     assert "linux" not in name or "-linux_" in name  # auditwheel decides on manylinux
@@ -122,40 +90,22 @@ def test_the_wheel_has_the_library_and_is_tied_to_no_python(tmp_path):
 
 
 def test_without_a_compiler_there_is_a_wheel_without_the_library(tmp_path):
-    name, files, said = built_wheel(tmp_path, CC="no-such-compiler")
-    assert name.endswith("-py3-none-any.whl")
-    assert "sb3_sparse/engine/native/kernels.so" not in files
+    wheel, said = built_wheel(tmp_path, CC="no-such-compiler")
+    assert wheel.name.endswith("-py3-none-any.whl")
+    assert "sb3_sparse/engine/native/kernels.so" not in zipfile.ZipFile(wheel).namelist()
     assert "the sparse kernels were not compiled" in said
-
-
-@pytest.fixture(scope="module")
-def sanitized(tmp_path_factory):
-    """Runs a program on kernels that the address sanitizer watches."""
-    made = tmp_path_factory.mktemp("sanitized") / "kernels.so"
-    build_hook().compile_kernels(SOURCES, made, ("-fsanitize=address", "-g", "-O1"))
-    runtime = subprocess.run(
-        ["gcc", "-print-file-name=libasan.so"], check=True, capture_output=True, text=True
-    ).stdout.strip()
-    environment = {**os.environ, "LD_PRELOAD": runtime, "ASAN_OPTIONS": "detect_leaks=0"}
-
-    def run(program: str, *arguments: str) -> subprocess.CompletedProcess[str]:
-        return subprocess.run(
-            [sys.executable, str(Path(__file__).with_name(program)), str(made), *arguments],
-            env=environment, capture_output=True, text=True,
-        )  # fmt: skip
-
-    return run
 
 
 @NEEDS_COMPILER
 @pytest.mark.parametrize("program", ["bounds.py", "image_bounds.py"])
 @pytest.mark.parametrize("instructions", library.instruction_sets())
 def test_the_kernels_stay_within_bounds_under_the_address_sanitizer(
-    sanitized, instructions, program
+    watched_kernels, instructions, program
 ):
-    done = sanitized(program, instructions)
+    path = Path(__file__).with_name(program)
+    done = run_watched(path, watched_kernels, instructions)
     assert done.returncode == 0, done.stderr[-3000:]
     assert done.stdout.split()[-1] == "passes"
     # The same with one connection or place beyond the end: it must be noticed.
-    broken = sanitized(program, instructions, "x")
+    broken = run_watched(path, watched_kernels, instructions, "x")
     assert "AddressSanitizer: heap-buffer-overflow" in broken.stderr
