@@ -13,6 +13,7 @@ import argparse
 import math
 import re
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -23,7 +24,7 @@ from tempfile import TemporaryDirectory
 
 from front import front
 
-from sb3_sparse.pages.numbers import short
+from sb3_sparse.pages.numbers import counted_between, short
 from sb3_sparse.pages.plot import Drawing, styled, svg_of
 from sb3_sparse.pages.table import Cell, Table
 from sb3_sparse.report import FIGURES, FINDINGS, Results, Verdict, judge, read_runs
@@ -254,12 +255,13 @@ class Drawn:
         """The picture of the README: speed, and return against parameters."""
         shown = self.shown(*FRONT)
         self.figures["front"] = lambda: front(shown.results)
-        seeds = len({run.seed for run in shown.results.main})
+        runs = Counter((run.env_id, run.label, run.level) for run in shown.results.main)
+        seeds = counted_between(runs.values(), "seed")
         yield "![learn() against SB3 and SBX; return against parameters](docs/figures/front.svg)"
         yield ""
         yield (
             f"Left: measured with [this command](#how-it-compares). Right: DQN, {shown.steps:,} "
-            f"steps, {seeds} seeds: their [intervals](docs/findings.md) rank no methods yet."
+            f"steps, {seeds}; [what they show](docs/findings.md), with intervals."
         )
 
     def _scores(self, name: str, scale: str, figure: str) -> Iterator[str]:

@@ -7,7 +7,7 @@ import re
 import pytest
 
 from sb3_sparse.pages import html
-from sb3_sparse.pages.numbers import short, shorten
+from sb3_sparse.pages.numbers import counted_between, short, shorten
 from sb3_sparse.pages.table import Cell, Table
 
 GIVEN = Table(
@@ -97,3 +97,10 @@ def test_columns_of_one_value_are_said_once():
     assert same == {"task": "A", "seeds": 3}
     one = Table(["task", "seeds"], [["A", 3]])
     assert one.varying() == (one, {})
+
+
+@pytest.mark.parametrize(
+    ("counts", "text"), [([1], "1 seed"), ([5, 5], "5 seeds"), ([4, 1, 1200], "1 to 1,200 seeds")]
+)
+def test_counts_are_written_from_the_least_to_the_greatest(counts, text):
+    assert counted_between(counts, "seed") == text

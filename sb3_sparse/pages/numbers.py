@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 DIGITS = 2
 PLAIN = range(-3, 7)  # powers of ten of the numbers that are written without an exponent
@@ -39,6 +39,12 @@ def shorten(values: Sequence[float]) -> list[str]:
 def counted(number: int, thing: str) -> str:
     """Write how many there are of a thing, e.g. ``"1 seed"`` and ``"1,000 seeds"``."""
     return f"{number:,} {thing}" + ("s" if number != 1 else "")
+
+
+def counted_between(numbers: Collection[int], thing: str) -> str:
+    """Write the least and the greatest of several counts, e.g. ``"3 to 5 seeds"``."""
+    low, high = min(numbers), max(numbers)
+    return f"{low:,} to {counted(high, thing)}" if low < high else counted(high, thing)
 
 
 def _trimmed(text: str) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from statistics import fmean, geometric_mean
 
-from sb3_sparse.pages.numbers import counted, shorten
+from sb3_sparse.pages.numbers import counted, counted_between, shorten
 from sb3_sparse.report.data import RunData
 from sb3_sparse.report.measured import returns_by_sigma, snr_by_network
 from sb3_sparse.report.methods import EQUAL, headline, name_of, percent
@@ -45,7 +45,7 @@ def _noise(results: Results) -> Iterator[str]:
             if not levels:
                 continue
             level = headline(levels)
-            texts, seeds = [], set()
+            texts, counts = [], []
             labels = results.labels(family, level)
             for label in sorted(labels, key=lambda label: label in PLAIN):
                 ends = [_ends(run) for run in results.cell(family, env_id, label, level)]
@@ -53,10 +53,11 @@ def _noise(results: Results) -> Iterator[str]:
                 if known:
                     quiet, loud = shorten([fmean(values) for values in zip(*known, strict=True)])
                     texts.append(f"{PLAIN.get(label, name_of(label))} {quiet} and {loud}")
-                    seeds.add(len(known))
+                    counts.append(len(known))
+            seeds = counted_between(counts, "seed")
             yield (
                 f"{task_of(results, family, env_id)} at {percent(level)}, mean returns without "
-                f"noise and with the strongest: {'; '.join(texts)}; {_seeds(seeds)}."
+                f"noise and with the strongest: {'; '.join(texts)}; {seeds}."
             )
 
 
@@ -75,10 +76,11 @@ def _snr(results: Results) -> Iterator[str]:
                 means = shorten([geometric_mean(by_level[level]) for level in sorted(by_level)])
                 levels = ("dense" if not level else percent(level) for level in sorted(by_level))
                 texts = (f"{level} {mean}" for level, mean in zip(levels, means, strict=True))
+                seeds = counted_between([*map(len, by_level.values())], "seed")
                 of = f", {network}" if len(found) > 1 else ""
                 yield (
                     f"{task_of(results, family, env_id)}{of}, geometric mean of the ratio over "
-                    f"training: {'; '.join(texts)}; {_seeds({*map(len, by_level.values())})}."
+                    f"training: {'; '.join(texts)}; {seeds}."
                 )
 
 
@@ -91,11 +93,6 @@ def _ends(run: RunData) -> tuple[float, float] | None:
     by_sigma = returns_by_sigma(run.measured)
     strongest = max(by_sigma, default=0.0)
     return (by_sigma[0.0], by_sigma[strongest]) if strongest and 0.0 in by_sigma else None
-
-
-def _seeds(counts: set[int]) -> str:
-    low, high = min(counts), max(counts)
-    return f"{low} to {high} seeds" if low < high else counted(high, "seed")
 
 
 MEASURED: dict[str, Callable[[Results], Iterator[str] | list[str]]] = {

@@ -9,7 +9,7 @@ from typing import Any
 from sb3_sparse.intervals import mean_interval
 from sb3_sparse.pages.backend import Axes
 from sb3_sparse.pages.lines import ANY, Within, curve, points
-from sb3_sparse.pages.numbers import counted
+from sb3_sparse.pages.numbers import counted_between
 from sb3_sparse.pages.plot import LINE, Drawing, Sheet
 from sb3_sparse.report.data import Array
 from sb3_sparse.report.methods import look_of
@@ -167,8 +167,7 @@ class Grid(Sheet):
         rows, columns = len(self.lines_of), len(self.names)
         remarks = [*self.remarks, *remarks]
         if self.counts:
-            low, high = min(self.counts), max(self.counts)
-            seeds = f"{low} to {high} seeds" if low < high else counted(high, "seed")
+            seeds = counted_between(self.counts, "seed")
             self.title = ", ".join(text for text in (self.title, seeds) if text)
         if self.flowing:
             for one, row in zip(self.axes, self.lines_of, strict=True):
