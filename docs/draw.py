@@ -186,8 +186,8 @@ class Drawn:
                 why = "fewer than three seeds" if begun else "no runs yet"
                 rows.append(f"| {link} | | {why} | | | |")
         yield (
-            f"**{len(decided)} of {len(FINDINGS)} findings are decided so far.** An effect without "
-            "a verdict says where it may lie, and no more."
+            f"**Decided so far: {len(decided)} of {len(FINDINGS)} findings.** An effect without a "
+            "verdict says where it may lie, and no more."
         )
         yield ""
         yield "| the paper's finding | by | verdict | effect [95 % interval] | holds for | seeds |"
