@@ -69,8 +69,8 @@ class AutoCompute:
         if missing is not None and any(layer.nnz < layer.size for layer in layers):
             warn(
                 f"there are no kernels: {missing}. Training and acting take several times "
-                "as long. Reinstall sb3-sparse where there is a C compiler (gcc or clang), or give "
-                "compute='masked' if this is meant"
+                "as long. Reinstall sb3-sparse where there is a C compiler (gcc or clang), or set "
+                "compute='masked' to train so without this warning"
             )
         return choose(root, layers, self.allowed)
 

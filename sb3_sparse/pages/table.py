@@ -41,7 +41,8 @@ class Table:
     def varying(self, *keep: str) -> tuple[Table, dict[str, Any]]:
         """Return the table without the columns whose entries are all equal, and what these hold.
 
-        A table of one row keeps its columns; an empty one is left out without a word of any table.
+        A table of one row keeps its columns, except empty ones. What is said to be held leaves out
+        empty columns.
 
         :param keep: heads of columns that stay
         """

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from statistics import fmean
 
+from sb3_sparse.errors import ConfigError
 from sb3_sparse.pages.numbers import counted
 from sb3_sparse.report.data import RunData
 from sb3_sparse.report.methods import DENSE
@@ -87,6 +88,7 @@ class Normaliser:
 
     :param runs: where no scale is fixed, the dense runs of full size among them give it
     :param references: returns that fix the scale of tasks, before all others
+    :raises ConfigError: for a pair whose second return is not the greater
     """
 
     def __init__(self, runs: Iterable[RunData], references: References | None = None) -> None:
@@ -125,7 +127,14 @@ class Normaliser:
 
 def _given(env_id: str, references: References) -> Scale | None:
     pair = references.get(env_id)
-    return None if pair is None else Scale(*pair, "reference_returns of the study")
+    if pair is None:
+        return None
+    zero, one = pair
+    if not zero < one:
+        raise ConfigError(
+            f"the second of a task's reference returns must be the greater, got {pair} for {env_id}"
+        )
+    return Scale(zero, one, "reference_returns of the study")
 
 
 def _fixed(env_id: str) -> Scale | None:

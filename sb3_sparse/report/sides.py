@@ -38,7 +38,7 @@ class Sides:
     runs: tuple[RunData, ...] = ()
 
     def with_seeds(self, least: int) -> Sides:
-        """Return the sides over the strata that have as many seeds of both."""
+        """Return the comparisons of which both sides have at least so many seeds."""
         fit = [name for name in self.x if min(len(self.x[name]), len(self.y[name])) >= least]
         x, y = ({name: side[name] for name in fit} for side in (self.x, self.y))
         return Sides(x, y, self.why, self.runs)

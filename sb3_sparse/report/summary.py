@@ -17,7 +17,7 @@ from sb3_sparse.report.values import order_of, shown_value
 
 LEAST = 3
 """Seeds below which a mean has no interval here: that of two is mostly beyond possible returns."""
-PLAIN = {DENSE: "dense", EQUAL: "dense of equal parameters"}
+PLAIN = {DENSE: "dense", EQUAL: "dense with as many parameters"}
 
 
 @dataclass(frozen=True)

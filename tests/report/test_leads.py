@@ -20,7 +20,7 @@ def test_a_study_of_noise_says_what_noise_leaves_of_the_returns(folders):
     assert verdict.startswith("Sparse networks bear observation noise better than dense ones")
     assert sentence == (
         "CartPole-v1 at 80 %, mean returns without noise and with the strongest: RigL 410 and 210; "
-        "dense 500 and 40; dense of equal parameters 310 and 60; 1 to 2 seeds."
+        "dense 500 and 40; dense with as many parameters 310 and 60; 1 to 2 seeds."
     )
 
 

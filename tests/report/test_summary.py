@@ -33,7 +33,7 @@ def test_the_first_sentence_tells_what_the_best_sparse_method_scores(folders):
     add(folders, "rigl", 0.99, [400.0, 400.0, 400.0])
     assert sentences(results(folders)) == [
         "CartPole-v1 at 90 %: SET 310 [290; 330], the highest mean of 2 sparse methods; dense 210 "
-        "[190; 230]; dense of equal parameters 110 [85; 130]; 3 seeds."
+        "[190; 230]; dense with as many parameters 110 [85; 130]; 3 seeds."
     ]
 
 

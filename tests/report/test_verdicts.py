@@ -247,3 +247,12 @@ def test_an_effect_shows_on_which_side_of_nothing_its_ends_lie():
     shown = Verdict(FINDINGS[0], "DQN", UNDECIDED, -0.224, -0.458, 0.00004).shown
     assert shown == "-0.22 [-0.46; +0.00004]"
     assert Verdict(FINDINGS[0], "", UNDECIDED).shown == ""
+
+
+@pytest.mark.parametrize("pair", [(-60.0, -500.0), (1.0, 1.0), (0.0, float("nan"))])
+def test_reference_returns_that_are_no_scale_are_rejected(folders, pair):
+    folders.add("rigl", 0.9, 0)
+    runs, _ = read_runs(folders.made)
+    results = Results(tuple(runs), references={"CartPole-v1": pair})
+    with pytest.raises(ConfigError, match="must be the greater, got .* for CartPole-v1"):
+        judge(results)
