@@ -39,7 +39,8 @@ def test_train_says_what_it_does_and_enjoy_and_inspect_read_it(tmp_path):
     assert "Training DQN on CartPole-v1, rigl at 90% (ERK), seed 3" in done.stdout
     assert "\nGradient steps: fused\n" in done.stdout
     assert re.search(
-        r"1500 of 1500 steps, return \d+\.\d, sparsity 8\d\.\d\d%, \d+ steps/s", done.stdout
+        r"1500 of 1500 steps, training return \d+\.\d, sparsity 8\d\.\d\d%, \d+ steps/s",
+        done.stdout,
     )
     for step in (500, 1000, 1500):  # each evaluation is a line, also without a terminal
         line = rf"^evaluated at step {step}: return \d+\.\d ± \d+\.\d, best so far \d+\.\d$"

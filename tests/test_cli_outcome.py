@@ -5,15 +5,18 @@ from __future__ import annotations
 import io
 import json
 import re
+import time
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from rich.console import Console
+from stable_baselines3 import DQN, PPO
 
 from sb3_sparse.cli import outcome as ending
 from sb3_sparse.cli.progress.train import TrainingProgress, sparkline
 from sb3_sparse.zoo import Outcome, RunSpec, train
+from sb3_sparse.zoo.watch import TrainingLog
 
 RUN = RunSpec(
     algo="sac",
@@ -115,7 +118,9 @@ def test_a_terminal_of_80_columns_shows_the_bar_and_a_line_below_it(trained):
     shown = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", trained[1])
     assert "Training it" in shown
     assert re.search(r"300/300 steps, time left 0:00:00", shown)
-    last = re.findall(r"return -\d+\.\d, sparsity \d\d\.\d\d%, \d+ steps/s  ([▁-█]+)", shown)[-1]
+    last = re.findall(
+        r"training return -\d+\.\d, sparsity \d\d\.\d\d%, \d+ steps/s  ([▁-█]+)", shown
+    )[-1]
     assert len(last) == 3  # evaluations
     assert re.search(r"evaluated at step 200: return", shown)
     assert "of 300 steps" not in shown  # the lines that stand for the view elsewhere
@@ -134,6 +139,37 @@ def test_without_a_terminal_lines_say_the_time_left(tmp_path):
     train(RUN, tmp_path, watch=TrainingProgress(console, "Training it"))
     lines = [line for line in file.getvalue().splitlines() if "of 300 steps" in line]
     assert len(lines) == 10
-    for line in lines[:-1]:
+    for line in lines[:3]:  # at most 90 steps, and the 100 before learning_starts say nothing
+        assert re.search(r"sparsity \d\d\.\d\d%, \d+ steps/s$", line)
+    for line in lines[4:-1]:
         assert re.search(r"sparsity \d\d\.\d\d%, \d+ steps/s, \d:\d\d:\d\d left$", line)
-    assert re.search(r"300 of 300 steps, return \S+, sparsity \S+%, \d+ steps/s$", lines[-1])
+    assert re.search(
+        r"300 of 300 steps, training return \S+, sparsity \S+%, \d+ steps/s$", lines[-1]
+    )
+
+
+class Clocked(TrainingLog):
+    """Takes a millisecond a step until learning starts, and a second from then on."""
+
+    def _on_step(self) -> bool:
+        collecting = self.num_timesteps <= getattr(self.model, "learning_starts", 0)
+        self.clock.append(self.clock[-1] + (10**6 if collecting else 10**9))
+        super()._on_step()
+        self.left.append(self.seconds_left())
+        return True
+
+
+@pytest.mark.parametrize(
+    ("model", "unknown"),
+    [
+        (lambda: DQN("MlpPolicy", "CartPole-v1", learning_starts=50, train_freq=1), 51),
+        (lambda: PPO("MlpPolicy", "CartPole-v1", n_steps=32, batch_size=32, n_epochs=1), 32),
+    ],
+)
+def test_the_time_left_goes_by_the_speed_of_learning(monkeypatch, model, unknown):
+    log = Clocked(say=lambda line: None)
+    log.clock, log.left = [0], []
+    monkeypatch.setattr(time, "time_ns", lambda: log.clock[-1])
+    model().learn(96, callback=log)
+    assert log.left[:unknown] == [None] * unknown
+    assert log.left[unknown:] == pytest.approx([96 - step for step in range(unknown + 1, 97)])

@@ -15,7 +15,11 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_sparse.policies.base import BaseSparsePolicy
 from sb3_sparse.policies.compiled import unwrapped
-from sb3_sparse.policies.internals import planned_timesteps, timesteps_since_start
+from sb3_sparse.policies.internals import (
+    planned_timesteps,
+    timesteps_since_start,
+    updates_done,
+)
 from sb3_sparse.zoo.computing import gradient_steps_of
 from sb3_sparse.zoo.match import Match
 
@@ -87,6 +91,8 @@ class TrainingLog(Watch):
     def _on_training_start(self) -> None:
         self.planned = planned_timesteps(self.model)
         self.tenths = 0
+        self.updates = updates_done(self.model)
+        self.collected = self.num_timesteps, self.model.start_time
         policy = unwrapped(self.model.policy)
         if isinstance(policy, BaseSparsePolicy):
             sparse = [layer.is_sparse for layer in policy.sparse.layers]
@@ -95,31 +101,45 @@ class TrainingLog(Watch):
         self.say(f"Gradient steps: {gradient_steps_of(self.model)}")
 
     def _on_step(self) -> bool:
-        done = min(self.num_timesteps, self.planned)
+        if self.num_timesteps <= getattr(self.model, "learning_starts", 0):
+            self.collected = self.num_timesteps, time.time_ns()
+        self.stepped(min(self.num_timesteps, self.planned))
+        return True
+
+    def stepped(self, done: int) -> None:
+        """Called after each step of the environments.
+
+        :param done: environment steps trained, at most those planned
+        """
         tenths = 10 * done // self.planned
         if tenths > self.tenths:
             self.tenths = tenths
             left = self.seconds_left()
             time_left = f", {timedelta(seconds=round(left))} left" if left else ""
             self.say(f"{done} of {self.planned} steps, {self.status()}{time_left}")
-        return True
 
     def seconds_left(self) -> float | None:
-        """Return the seconds that the rest of the training takes at its mean speed.
+        """Return the seconds that the rest of the training takes at its speed so far.
 
-        :return: None before the first step
+        It goes by the mean speed since ``learning_starts``: steps before it are many times as fast.
+
+        :return: None before the first gradient step
         """
-        done = timesteps_since_start(self.model)
-        left = self.planned - min(self.num_timesteps, self.planned)
-        return left * self._seconds() / done if done else None
+        collected, at = self.collected
+        done = self.num_timesteps - collected
+        if done <= 0 or updates_done(self.model) == self.updates:
+            return None
+        left = max(self.planned - self.num_timesteps, 0)
+        return left * (time.time_ns() - at) / 1e9 / done
 
     def status(self) -> str:
         """Return the mean return of recent episodes, the sparsity, and steps per second as text.
 
-        Evaluation time counts, as in SB3's ``time/fps``.
+        The episodes are those of training, which explore. Evaluation time counts, as in SB3's
+        ``time/fps``.
         """
         returns = [float(episode["r"]) for episode in self.model.ep_info_buffer or ()]
-        text = f"return {fmean(returns):.1f}" if returns else "return –"
+        text = f"training return {fmean(returns):.1f}" if returns else "training return –"
         policy = unwrapped(self.model.policy)
         if isinstance(policy, BaseSparsePolicy):
             text += f", sparsity {policy.sparse.sparsity:.2%}"

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from datetime import timedelta
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console, RenderableType
-from rich.progress import Progress, TaskID, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import Progress, TaskID, TimeElapsedColumn
 from rich.text import Text
 
 from sb3_sparse.cli.progress import Bar
@@ -87,8 +88,7 @@ class TrainingProgress(TrainingLog):
         self.folder: Path | None = None
         self.episodes = EpisodesProgress(console)
         self.returns: list[float] = []
-        left = TimeRemainingColumn()
-        self.steps = Bar(console, "steps, time left", left, kind=WithLine)
+        self.steps = Bar(console, "steps, time left {task.fields[left]}", kind=WithLine)
 
     def begins(self, folder: Path, match: Match | None) -> None:
         self.folder = folder
@@ -104,20 +104,24 @@ class TrainingProgress(TrainingLog):
 
     def _on_training_start(self) -> None:
         super()._on_training_start()
-        self.task = self.steps.bar.add_task("", total=self.planned, line=self.line())
+        self.task = self.steps.bar.add_task("", total=self.planned, **self.fields())
         self.steps.bar.start()
 
-    def _on_step(self) -> bool:
+    def stepped(self, done: int) -> None:
         if self.steps.bar.disable:
-            return super()._on_step()
-        done = min(self.num_timesteps, self.planned)
-        if self.n_calls % REFRESH_STEPS == 0 or done == self.planned:
-            self.steps.bar.update(self.task, completed=done, line=self.line())
-        return True
+            super().stepped(done)
+        elif self.n_calls % REFRESH_STEPS == 0 or done == self.planned:
+            self.steps.bar.update(self.task, completed=done, **self.fields())
 
     def _on_training_end(self) -> None:
-        self.steps.bar.update(self.task, completed=self.planned, line=self.line())
+        self.steps.bar.update(self.task, completed=self.planned, **self.fields())
         self.close()
+
+    def fields(self) -> dict[str, Any]:
+        """Return the texts of the bar."""
+        left = self.seconds_left()
+        time_left = "–" if left is None else str(timedelta(seconds=round(left)))
+        return {"left": time_left, "line": self.line()}
 
     def line(self) -> str:
         """Return the line below the bar."""
