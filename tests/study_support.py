@@ -65,7 +65,7 @@ def archived(cell: Cell, spent: float | None, score: float = 100.0, **changed: A
     :param score: return of its only evaluation
     :param changed: other entries of the record
     """
-    run, settings = cell.run, cell.run.settings()
+    run, settings = cell.run, cell.settings
     kwargs = settings.policy_kwargs
     layer = {"network": "q_net", "name": "q_net.0", "shape": [10, 10], "nnz": 100, "flops": 1}
     record = {

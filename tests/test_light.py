@@ -12,9 +12,6 @@ from pkgutil import iter_modules
 
 import pytest
 
-from sb3_sparse.studies.blocks import SCALES, planned_runs, study_names
-from sb3_sparse.studies.spec import Study
-
 HEAVY = ["torch", "stable_baselines3", "sb3_contrib", "rl_zoo3", "optuna", "matplotlib", "pandas"]
 
 
@@ -183,12 +180,3 @@ def test_names_that_are_imported_as_needed_are_no_modules(package):
         getattr(module, name)
     with pytest.raises(AttributeError, match="has no attribute 'nothing'"):
         module.nothing  # noqa: B018
-
-
-@pytest.mark.parametrize("name", study_names())
-def test_the_list_of_studies_counts_the_runs_that_there_are(name):
-    planned = planned_runs(name)
-    assert set(planned) in (set(SCALES), set(SCALES) - {"medium"})
-    for scale, runs in planned.items():
-        study = Study.read(name, scale)
-        assert runs == len(study.cells) + len(study.merged), scale

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from sb3_sparse.studies.measures import Measures
 from sb3_sparse.zoo.folder import RunFolder, env_name
+from sb3_sparse.zoo.settings import Settings
 from sb3_sparse.zoo.spec import RunSpec
 
 RUNS = "runs"
@@ -38,12 +39,18 @@ class Cell:
         measures during training; not the device, nor measures of the trained model, which may be
         added later.
         """
+        content = {**self._content, "seed": self.run.seed}
+        text = json.dumps(content, sort_keys=True, default=_plain)
+        return hashlib.sha256(text.encode()).hexdigest()[:DIGITS]
+
+    @cached_property
+    def _content(self) -> dict[str, Any]:
+        """What determines the result, but for the seed."""
         run = self.run
-        content = {
+        content: dict[str, Any] = {
             "algo": run.algo,
             "env_id": run.env_id,
-            "seed": run.seed,
-            "settings": run.settings().as_dict(),
+            "settings": self.settings.as_dict(),
             "evaluation": run.evaluation(),
             "match_params": run.match_params,
             "during": self.measures.during,
@@ -51,8 +58,18 @@ class Cell:
         }
         if run.gym_packages:
             content["gym_packages"] = run.gym_packages
-        text = json.dumps(content, sort_keys=True, default=_plain)
-        return hashlib.sha256(text.encode()).hexdigest()[:DIGITS]
+        return content
+
+    @cached_property
+    def settings(self) -> Settings:
+        """The settings of its run."""
+        return self.run.settings()
+
+    def with_seed(self, seed: int) -> Cell:
+        """Return the same cell with another seed, on which its settings do not depend."""
+        other = replace(self, run=replace(self.run, seed=seed))
+        vars(other).update(settings=self.settings, _content=self._content)
+        return other
 
     def folder(self, store: Path) -> RunFolder:
         """Return the run's folder, ``<store>/runs/<algo>/<env>_<address>``."""

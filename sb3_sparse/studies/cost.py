@@ -6,7 +6,7 @@ import json
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -117,7 +117,7 @@ class Costs:
         """
         if not cell.trained:
             return Cost(1)
-        run, settings = cell.run, cell.run.settings()
+        run, settings = cell.run, cell.settings
         steps = max(0, int(settings["n_timesteps"]) - done)
         asked = settings.policy_kwargs.get("sparsity")
         for place, key in enumerate(_keys(run.as_dict(), run.name_of(settings), asked)):
@@ -145,7 +145,7 @@ def but_for_seeds(statuses: Iterable[CellStatus]) -> list[list[CellStatus]]:
     """Group cells that differ in the seed alone."""
     found: dict[str, list[CellStatus]] = defaultdict(list)
     for one in statuses:
-        found[replace(one.cell, run=replace(one.cell.run, seed=0)).address].append(one)
+        found[one.cell.with_seed(0).address].append(one)
     return list(found.values())
 
 

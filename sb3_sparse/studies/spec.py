@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -100,7 +100,7 @@ class Study:
             near = did_you_mean(scale, map(str, scales)) if isinstance(scales, Mapping) else ""
             raise ConfigError(f"{path} has no scale {scale!r}{near}, only {known}")
         try:
-            given = list(_cells(content, scales[scale] or {}, gym_packages))
+            given = _cells(content, scales[scale] or {}, gym_packages)
             times = Counter(cell.address for cell in given)
         except ConfigError as error:
             raise ConfigError(f"{path}, scale {scale}: {error}") from error
@@ -124,10 +124,8 @@ class Study:
         return Path(self.name) / self.scale
 
 
-def _cells(
-    content: Mapping[str, Any], of_scale: Any, gym_packages: Sequence[str]
-) -> Iterator[Cell]:
-    """Yield all cells of a scale as the file has them, first seeds first."""
+def _cells(content: Mapping[str, Any], of_scale: Any, gym_packages: Sequence[str]) -> list[Cell]:
+    """Return all cells of a scale as the file has them, first seeds first."""
     check_keys(of_scale, RUN_KEYS | {SEEDS, MEASURES, SCHEDULE, VARY}, "a scale")
     if not isinstance(content["runs"], list):
         raise ConfigError(f"runs must be a list of blocks, got {content['runs']!r}")
@@ -152,11 +150,10 @@ def _cells(
         for whole in [{**given, PACKAGES: (*known, *gym_packages)}]
         for arguments in [_with_schedule(whole, schedule)]
     ]
-    for seed in range(seeds):
-        for arguments in runs:
-            cell = Cell(RunSpec(**arguments, seed=seed), measures, trained)
-            measures.check(cell.run.algorithm)
-            yield cell
+    cells = [Cell(RunSpec(**arguments), measures, trained) for arguments in runs]
+    for cell in cells:
+        measures.check(cell.run.algorithm)
+    return [cell.with_seed(seed) for seed in range(seeds) for cell in cells]
 
 
 def _check_varies(varies: Any, cells: Sequence[Cell], path: Path) -> None:
