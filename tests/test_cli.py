@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from forks import run_in_forks
 from stable_baselines3 import DQN, PPO
 from support import make
 
@@ -22,79 +23,82 @@ from sb3_sparse.cli import main
 QUICK = ["--hyperparams", "net_arch:[24,24]", "batch_size:16"]
 
 
-def sb3_sparse(
-    *args: str, cwd: Path, without: str | None = None
-) -> subprocess.CompletedProcess[str]:
-    hide = f"import sys; sys.modules[{without!r}] = None; " if without else ""
-    code = f"{hide}from sb3_sparse.cli import main; main()"
-    command = [sys.executable, "-c", code, *args]
-    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=False)
+@pytest.fixture
+def sb3_sparse(tmp_path, monkeypatch, capsys):
+    """Runs a command in the test's folder, and gives its exit code and what it printed."""
+
+    def call(*args: str) -> tuple[int, str, str]:
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr(sys, "argv", ["sb3-sparse", *args])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        return ended.value.code, *capsys.readouterr()
+
+    return call
 
 
-def test_train_says_what_it_does_and_enjoy_and_inspect_read_it(tmp_path):
+def test_train_says_what_it_does_and_enjoy_and_inspect_read_it(tmp_path, sb3_sparse):
     evaluation = ["--eval-freq", "500", "--eval-episodes", "2"]
     run = ["--env", "CartPole-v1", "-n", "1500", "--seed", "3"]
-    done = sb3_sparse("train", *run, *evaluation, *QUICK, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert "Training DQN on CartPole-v1, rigl at 90% (ERK), seed 3" in done.stdout
-    assert "\nGradient steps: fused\n" in done.stdout
-    assert re.search(
-        r"1500 of 1500 steps, training return \d+\.\d, sparsity 8\d\.\d\d%, \d+ steps/s",
-        done.stdout,
-    )
+    code, said, errors = sb3_sparse("train", *run, *evaluation, *QUICK)
+    assert code == 0, errors
+    assert "Training DQN on CartPole-v1, rigl at 90% (ERK), seed 3" in said
+    assert "\nGradient steps: fused\n" in said
+    progress = r"1500 of 1500 steps, training return \d+\.\d, sparsity 8\d\.\d\d%, \d+ steps/s"
+    assert re.search(progress, said)
     for step in (500, 1000, 1500):  # each evaluation is a line, also without a terminal
         line = rf"^evaluated at step {step}: return \d+\.\d ± \d+\.\d, best so far \d+\.\d$"
-        assert re.search(line, done.stdout, re.MULTILINE)
-    assert "Evaluating the last policy, episodes: 2" in done.stdout
-    assert "Return over 2 episodes:" in done.stdout
+        assert re.search(line, said, re.MULTILINE)
+    assert "Evaluating the last policy, episodes: 2" in said
+    assert "Return over 2 episodes:" in said
     folder = Path("logs") / "dqn" / "CartPole-v1_1"
     for what, name in (("Last policy", "CartPole-v1.zip"), ("Best policy", "best_model.zip")):
         score = r":\s+\d+\.\d ± \d+\.\d  "
-        assert re.search(what + score + re.escape(str(folder / name)), done.stdout)
+        assert re.search(what + score + re.escape(str(folder / name)), said)
     path = tmp_path / folder / "CartPole-v1.zip"
     assert DQN.load(path).num_timesteps == 1500
 
-    done = sb3_sparse("enjoy", str(folder), "-n", "2", "--best", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert re.search(r"Best policy:\s+\d+\.\d ± \d+\.\d  .*best_model.zip", done.stdout)
+    code, said, errors = sb3_sparse("enjoy", str(folder), "-n", "2", "--best")
+    assert code == 0, errors
+    assert re.search(r"Best policy:\s+\d+\.\d ± \d+\.\d  .*best_model.zip", said)
 
-    done = sb3_sparse("inspect", str(path.with_suffix("")), cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    code, said, errors = sb3_sparse("inspect", str(path.with_suffix("")))
+    assert code == 0, errors
     # 4-24-24-2 has 96 + 576 + 48 connections; with floors, 72 or one or two more remain
-    nnz, density = re.search(r"total\s+(\d+)\s+(0\.\d+)", done.stdout).groups()
+    nnz, density = re.search(r"total\s+(\d+)\s+(0\.\d+)", said).groups()
     assert 72 <= int(nnz) <= 75
     assert float(density) == round(int(nnz) / 720, 4)
-    assert "The run asked for compute='auto'." in done.stdout
-    assert "Trained from step 0: 0 of 3 layers in sparse storage" in done.stdout
+    assert "The run asked for compute='auto'." in said
+    assert "Trained from step 0: 0 of 3 layers in sparse storage" in said
 
 
 @pytest.mark.parametrize("compute", ["auto", "sparse"])
-def test_inspect_says_how_large_layers_compute(tmp_path, compute):
+def test_inspect_says_how_large_layers_compute(tmp_path, compute, sb3_sparse):
     kwargs = dict(sparsity=0.99, net_arch=[300, 300], compute=compute)
     make("SAC", policy_kwargs=kwargs, batch_size=128).save(tmp_path / "model")
-    done = sb3_sparse("inspect", "model.zip", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    sparse = re.findall(r"^(\S+) .* sparse$", done.stdout, re.MULTILINE)
+    code, said, errors = sb3_sparse("inspect", "model.zip")
+    assert code == 0, errors
+    sparse = re.findall(r"^(\S+) .* sparse$", said, re.MULTILINE)
     critics = [f"critic.qf{i}.{j}" for i in (0, 1) for j in (0, 2, 4)]
     heads = ["actor.mu", "actor.log_std"] if compute == "sparse" else []
     assert sparse == ["actor.latent_pi.0", "actor.latent_pi.2", *heads, *critics]
     chosen = "compute='auto': 8 of 10 layers in sparse storage here"
-    assert (chosen in done.stdout) == (compute == "auto")
-    assert ("was made with compute='sparse'" in done.stdout) == (compute == "sparse")
+    assert (chosen in said) == (compute == "auto")
+    assert ("was made with compute='sparse'" in said) == (compute == "sparse")
 
 
-def test_inspect_of_a_damaged_file_and_of_a_model_without_minibatches(tmp_path):
+def test_inspect_of_a_damaged_file_and_of_a_model_without_minibatches(tmp_path, sb3_sparse):
     make("A2C", n_steps=6).save(tmp_path / "model")
-    done = sb3_sparse("inspect", "model.zip", cwd=tmp_path)
-    assert "compute='auto' keeps masks" in done.stdout, done.stderr
+    _, said, errors = sb3_sparse("inspect", "model.zip")
+    assert "compute='auto' keeps masks" in said, errors
     with zipfile.ZipFile(tmp_path / "half.zip", "w") as half:
         half.writestr("_stable_baselines3_version", "2.9.2")
-    done = sb3_sparse("inspect", "half.zip", cwd=tmp_path)
-    assert done.returncode == 2
-    assert "half.zip is damaged" in done.stderr
+    code, _, errors = sb3_sparse("inspect", "half.zip")
+    assert code == 2
+    assert "half.zip is damaged" in errors
 
 
-def test_a_killed_run_goes_on_from_its_last_evaluation(tmp_path):
+def test_a_killed_run_goes_on_from_its_last_evaluation(tmp_path, sb3_sparse):
     folder = tmp_path / "logs" / "dqn" / "CartPole-v1_1"
     args = ["--algo", "dqn", "-n", "3000", "--eval-freq", "300", "--eval-episodes", "1", *QUICK]
     code = "from sb3_sparse.cli import main; main()"
@@ -105,8 +109,8 @@ def test_a_killed_run_goes_on_from_its_last_evaluation(tmp_path):
     running.kill()
     running.wait()
     assert not (folder / "CartPole-v1.zip").exists()
-    done = sb3_sparse("train", "--resume", str(folder), cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    code, _, errors = sb3_sparse("train", "--resume", str(folder))
+    assert code == 0, errors
     with np.load(folder / "evaluations.npz") as evaluations:
         assert evaluations["timesteps"].tolist() == list(range(300, 3001, 300))
     assert DQN.load(folder / "CartPole-v1.zip").num_timesteps == 3000
@@ -148,25 +152,17 @@ def test_an_interrupt_says_how_to_go_on_with_this_run(folder, monkeypatch, capsy
         assert last == "sb3-sparse train --resume 'my logs/dqn/CartPole-v1_3'"
 
 
-def test_options_and_a_second_run_beside_the_first(tmp_path):
+def test_options_and_a_second_run_beside_the_first(tmp_path, sb3_sparse):
     args = ["--algo", "ppo", "--env", "CartPole-v1", "--method", "prune", "--sparsity", "0.8"]
-    args += [
-        "--distribution",
-        "uniform",
-        "-n",
-        "600",
-        "--log-folder",
-        "else where",
-        "--n-envs",
-        "2",
-    ]
+    args += ["--distribution", "uniform", "-n", "300", "--log-folder", "else where"]
+    args += ["--n-envs", "2", "--eval-episodes", "2"]
     for number in (1, 2):
-        done = sb3_sparse("train", *args, cwd=tmp_path)
-        assert done.returncode == 0, done.stderr
+        code, said, errors = sb3_sparse("train", *args)
+        assert code == 0, errors
         path = tmp_path / "else where" / "ppo" / f"CartPole-v1_{number}" / "CartPole-v1.zip"
         model = PPO.load(path)
         folder = f"else where/ppo/CartPole-v1_{number}"
-        enjoy, export, study = map(shlex.split, done.stdout.splitlines()[-3:])
+        enjoy, export, study = map(shlex.split, said.splitlines()[-3:])
         assert enjoy == ["sb3-sparse", "enjoy", folder]
         assert export == ["sb3-sparse", "export", folder, "--to", "c", "policy.c"]
         assert study == ["sb3-sparse", "study", "list"]
@@ -216,34 +212,55 @@ def test_enjoy_of_what_is_no_run(mistake):
     )
 
 
-@pytest.mark.parametrize(
-    ("missing", "args", "cure"),
-    [
-        ("rl_zoo3", [], "sb3-sparse[zoo]"),
-        ("rich", [], "sb3-sparse[zoo]"),
-        ("yaml", [], "sb3-sparse[zoo]"),
-        ("ale_py", ["--env", "PongNoFrameskip-v4"], "PongNoFrameskip-v4 needs sb3-sparse[atari]"),
-        ("cv2", ["--env", "PongNoFrameskip-v4"], "PongNoFrameskip-v4 needs sb3-sparse[atari]"),
-        (
-            "shimmy",
-            ["--env", "dm_control/dog-run-v0"],
-            "dm_control/dog-run-v0 needs sb3-sparse[dmc]",
-        ),
-        (
-            "dm_control",
-            ["--env", "dm_control/dog-run-v0"],
-            "dm_control/dog-run-v0 needs sb3-sparse[dmc]",
-        ),
-        ("mujoco", ["--algo", "sac", "--env", "Ant-v5"], "Ant-v5 needs sb3-sparse[mujoco]"),
-        ("tensorboard", ["-tb", "tb"], "pip install tensorboard"),
-    ],
-)
-def test_a_missing_extra_of_a_run_names_its_cure_in_one_line(missing, args, cure, tmp_path):
-    done = sb3_sparse("train", *args, cwd=tmp_path, without=missing)
-    assert done.returncode != 0
-    assert cure in done.stderr
-    assert "Traceback" not in done.stderr
-    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
+LACKS = """
+missing = {!r}
+loaded = [name for name in sys.modules if name.partition(".")[0] == missing]
+sys.modules.update(dict.fromkeys([missing, *loaded]))
+"""
+TRAIN = "sys.argv[1:] = {!r}\nfrom sb3_sparse.cli import main; main()"
+RUNS = {
+    "rl_zoo3": ([], "sb3-sparse[zoo]"),
+    "rich": ([], "sb3-sparse[zoo]"),
+    "yaml": ([], "sb3-sparse[zoo]"),
+    "ale_py": (["--env", "PongNoFrameskip-v4"], "PongNoFrameskip-v4 needs sb3-sparse[atari]"),
+    "cv2": (["--env", "PongNoFrameskip-v4"], "PongNoFrameskip-v4 needs sb3-sparse[atari]"),
+    "shimmy": (["--env", "dm_control/dog-run-v0"], "dm_control/dog-run-v0 needs sb3-sparse[dmc]"),
+    "dm_control": (
+        ["--env", "dm_control/dog-run-v0"],
+        "dm_control/dog-run-v0 needs sb3-sparse[dmc]",
+    ),
+    "mujoco": (["--algo", "sac", "--env", "Ant-v5"], "Ant-v5 needs sb3-sparse[mujoco]"),
+    "tensorboard": (["-tb", "tb"], "pip install tensorboard"),
+}
+IMPORTS = {
+    "typer": ("import sb3_sparse.cli", "sb3-sparse[zoo]"),
+    "sb3_contrib": ("import sb3_sparse; sb3_sparse.SparseTQCPolicy", "sb3-sparse[contrib]"),
+}
+
+
+@pytest.fixture(scope="module")
+def without(tmp_path_factory):
+    """What each command or import ends with that lacks a package."""
+    asked = {name: TRAIN.format(["train", *args]) for name, (args, _) in RUNS.items()}
+    asked |= {name: code for name, (code, _) in IMPORTS.items()}
+    codes = [LACKS.format(name) + code for name, code in asked.items()]
+    forks = run_in_forks("import stable_baselines3", codes, tmp_path_factory.mktemp("without"))
+    return dict(zip(asked, forks, strict=True))
+
+
+@pytest.mark.parametrize("missing", RUNS)
+def test_a_missing_extra_of_a_run_names_its_cure_in_one_line(missing, without):
+    done = without[missing]
+    assert done.code != 0
+    assert RUNS[missing][1] in done.err
+    assert "Traceback" not in done.err
+    assert not [path for path in done.folder.rglob("*") if path.is_file()]
+
+
+@pytest.mark.parametrize("missing", IMPORTS)
+def test_a_missing_extra_names_its_cure(missing, without):
+    assert without[missing].code != 0
+    assert IMPORTS[missing][1] in without[missing].err
 
 
 def test_inspect_of_what_is_no_model(tmp_path, mistake):
@@ -253,22 +270,6 @@ def test_inspect_of_what_is_no_model(tmp_path, mistake):
         ("notes.zip", "is damaged, or holds no model saved by SB3"),
     ):
         assert message in mistake("inspect", name)
-
-
-@pytest.mark.parametrize(
-    ("missing", "code", "cure"),
-    [
-        ("typer", "import sb3_sparse.cli", "sb3-sparse[zoo]"),
-        ("sb3_contrib", "import sb3_sparse; sb3_sparse.SparseTQCPolicy", "sb3-sparse[contrib]"),
-    ],
-)
-def test_a_missing_extra_names_its_cure(missing, code, cure, tmp_path):
-    script = f"import sys; sys.modules[{missing!r}] = None\n{code}"
-    done = subprocess.run(
-        [sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, check=False
-    )
-    assert done.returncode != 0
-    assert cure in done.stderr
 
 
 def test_the_core_works_without_any_extra(tmp_path):
