@@ -11,6 +11,7 @@ import torch as th
 from sb3_sparse.engine.native import library
 
 th.set_num_threads(1)
+os.environ["OMP_NUM_THREADS"] = "1"  # of the processes that tests start
 # A suite that a script starts in the background ignores Ctrl-C, and what it starts would, too.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 

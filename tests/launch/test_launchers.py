@@ -23,74 +23,92 @@ def ended(launcher, tasks, workers=2):
     return [end for end in launcher.run(tasks, workers) if end is not None]
 
 
+LOOK = """
+import os, random, numpy
+print("imported")
+importer = os.getpid()
+
+def look():
+    return importer, os.getppid(), os.getpid(), random.random(), numpy.random.random()
+"""
+
+
 @pytest.fixture(scope="module", params=NAMES)
-def launcher(request):
-    return launcher_named(request.param)
-
-
-def test_tasks_run_with_one_thread_each_and_return_what_they_made(launcher):
+def ends(request, tmp_path_factory):
+    """How tasks end, by their names."""
+    folder = tmp_path_factory.mktemp("modules")
+    (folder / "only_here.py").write_text("def answer():\n    return 42\n")
     tasks = [
+        Task("killed", "os:abort", {}),
         Task("root", "math:sqrt", {}),  # takes no keyword: fails
+        Task("lost", "no_such_module:f", {}),
+        Task("here", "only_here:answer", {}),
         Task("threads", "torch:get_num_threads", {}),
         Task("process", "os:getpid", {}),
         Task("other process", "os:getpid", {}),
     ]
-    ends = {end.task.name: end for end in ended(launcher, tasks)}
-    assert ends.keys() == {task.name for task in tasks}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.delenv("OMP_NUM_THREADS", raising=False)
+        patch.syspath_prepend(folder)
+        found = {end.task.name: end for end in ended(launcher_named(request.param), tasks)}
+    assert found.keys() == {task.name for task in tasks}
+    return found
+
+
+def test_tasks_run_with_one_thread_each_and_return_what_they_made(ends):
     assert "TypeError" in ends["root"].error
     assert ends["root"].value is None
     assert ends["threads"].value == 1
-    assert all(end.error is None for name, end in ends.items() if name != "root")
+    assert all(ends[name].error is None for name in ("threads", "process", "other process"))
     processes = {ends["process"].value, ends["other process"].value, os.getpid()}
     assert len(processes) == 3
 
 
-def test_tasks_find_modules_where_this_process_finds_them(launcher, tmp_path, monkeypatch):
-    (tmp_path / "only_here.py").write_text("def answer():\n    return 42\n")
-    monkeypatch.syspath_prepend(tmp_path)
-    (end,) = ended(launcher, [Task("here", "only_here:answer", {})])
-    assert (end.value, end.error) == (42, None)
+def test_tasks_find_modules_where_this_process_finds_them(ends):
+    assert (ends["here"].value, ends["here"].error) == (42, None)
 
 
-def test_modules_are_imported_once_for_all_local_tasks_and_chance_is_their_own(
-    tmp_path, monkeypatch
-):
-    (tmp_path / "slow_module.py").write_text(
-        "import os, random, numpy\n"
-        "print('imported')\n"
-        "importer = os.getpid()\n"
-        "def look():\n"
-        "    return importer, os.getppid(), random.random(), numpy.random.random()\n"
-    )
-    monkeypatch.syspath_prepend(tmp_path)
-    tasks = [Task(str(n), "slow_module:look", {}, tmp_path / f"{n}.log") for n in range(3)]
-    seen = [end.value for end in ended(launcher_named("local"), tasks)]
+@pytest.fixture(scope="module")
+def looks(tmp_path_factory):
+    """What six tasks of one module see, two at a time, and their logs."""
+    folder = tmp_path_factory.mktemp("looks")
+    (folder / "slow_module.py").write_text(LOOK)
+    tasks = [Task(str(n), "slow_module:look", {}, folder / f"{n}.log") for n in range(6)]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(folder)
+        seen = {end.task.name: end.value for end in ended(launcher_named("local"), tasks)}
+    return [seen[task.name] for task in tasks], [task.log.read_text() for task in tasks]
+
+
+def test_modules_are_imported_once_for_all_local_tasks_and_chance_is_their_own(looks):
+    seen, logs = looks
     (importer,) = {one[0] for one in seen}
     assert {one[1] for one in seen} == {importer}
     assert importer != os.getpid()
-    assert len({one[2] for one in seen}) == len({one[3] for one in seen}) == 3
-    assert [task.log.read_text() for task in tasks] == [""] * 3
+    assert len({one[3] for one in seen}) == len({one[4] for one in seen}) == 6
+    assert logs == [""] * 6
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="Linux numbers processes as they begin")
+def test_tasks_begin_in_their_order_with_several_workers_too(looks):
+    processes = [one[2] for one in looks[0]]
+    assert processes == sorted(processes)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="counts threads as Linux shows them")
-@pytest.mark.parametrize("function", [runner.FUNCTION, tuner.WORK])
-def test_modules_of_our_tasks_start_no_thread_that_a_fork_would_lose(function):
+def test_modules_of_our_tasks_start_no_thread_that_a_fork_would_lose():
+    modules = [function.partition(":")[0] for function in (runner.FUNCTION, tuner.WORK)]
     code = (
-        f"import {function.partition(':')[0]}, os, torch._dynamo\n"
+        f"import {', '.join(modules)}, os, torch._dynamo\n"
         "print(len(os.listdir('/proc/self/task')), torch.cuda.is_initialized())"
     )
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(
-        [sys.executable, "-c", code], env=environment, capture_output=True, text=True
-    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.stdout == "1 False\n", done.stderr
 
 
-def test_a_module_that_cannot_be_imported_fails_its_own_task_alone(launcher):
-    tasks = [Task("lost", "no_such_module:f", {}), Task("fine", "os:getpid", {})]
-    ends = {end.task.name: end for end in ended(launcher, tasks)}
+def test_a_module_that_cannot_be_imported_fails_its_own_task_alone(ends):
     assert "No module named 'no_such_module'" in ends["lost"].error
-    assert ends["fine"].error is None
+    assert ends["process"].error is None
 
 
 def test_a_module_that_ends_the_process_that_imports_it_is_told(tmp_path, monkeypatch):
@@ -98,14 +116,6 @@ def test_a_module_that_ends_the_process_that_imports_it_is_told(tmp_path, monkey
     monkeypatch.syspath_prepend(tmp_path)
     (end,) = ended(launcher_named("local"), [Task("exits", "exits:f", {})])
     assert end.error == "its process exited with 4\nso it is"
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="Linux numbers processes as they begin")
-def test_tasks_begin_in_their_order_with_several_workers_too():
-    tasks = [Task(str(n), "os:getpid", {}) for n in range(6)]
-    values = {int(end.task.name): end.value for end in ended(launcher_named("local"), tasks)}
-    processes = [values[n] for n in range(6)]
-    assert processes == sorted(processes)
 
 
 def test_ctrl_c_of_a_terminal_reaches_a_task_once_and_kills_nothing_else(tmp_path):
@@ -148,36 +158,26 @@ def test_ctrl_c_of_a_terminal_reaches_a_task_once_and_kills_nothing_else(tmp_pat
     assert noted.read_text() == f"{parent.pid} stopped"
 
 
-def test_a_killed_process_takes_no_other_task_with_it(launcher):
-    tasks = [
-        Task("killed", "os:abort", {}),
-        Task("left", "subprocess:getoutput", {"cmd": "echo here"}),
-    ]
-    ends = {end.task.name: end for end in ended(launcher, tasks, workers=1)}
+def test_a_killed_process_takes_no_other_task_with_it(ends):
     assert ends["killed"].error
-    assert ends["left"].value == "here"
+    assert ends["process"].error is None
 
 
-def test_no_more_than_so_many_at_a_time():
-    tasks = [Task(str(n), "time:sleep", {}) for n in range(3)]  # each fails, at once
-    began = [end.task.name for end in ended(launcher_named("local"), tasks, workers=1)]
-    assert began == ["0", "1", "2"]
-
-
-def test_output_goes_to_the_log_and_a_crash_shows_its_last_lines(tmp_path):
+def test_one_at_a_time_writes_to_the_log_and_a_crash_shows_its_last_lines(tmp_path):
     log = tmp_path / "logs" / "task.log"
-    (end,) = ended(
-        launcher_named("local"), [Task("exit", "os:_exit", {"status": 3}, log)], workers=1
-    )
-    assert "exited with 3" in end.error
-    assert log.is_file()
     code = "import sys; print('first'); print('last', file=sys.stderr)"
-    arguments = {"args": [sys.executable, "-c", code]}
-    (end,) = ended(
-        launcher_named("local"), [Task("talks", "subprocess:call", arguments, log)], workers=1
-    )
-    assert end.value == 0
+    tasks = [
+        Task("talks", "subprocess:call", {"args": [sys.executable, "-c", code]}, log),
+        Task("exits", "os:_exit", {"status": 3}, log),
+        Task("fails", "time:sleep", {}),
+    ]
+    talks, exits, fails = ended(launcher_named("local"), tasks, workers=1)
+    assert [end.task for end in (talks, exits, fails)] == tasks
+    assert talks.value == 0
     assert set(log.read_text().split()) == {"first", "last"}
+    how, *lines = exits.error.splitlines()
+    assert "exited with 3" in how
+    assert set(lines) == {"first", "last"}
 
 
 def test_closing_stops_what_runs_and_starts_no_more(tmp_path):

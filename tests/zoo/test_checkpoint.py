@@ -41,7 +41,7 @@ def stopped(tmp_path_factory):
 
 
 class Killed(BaseCallback):
-    """What a kill does after 150 steps; and which checkpoints there were until then."""
+    """What a kill does after 30 steps; and which checkpoints there were until then."""
 
     def __init__(self, root: Path) -> None:
         super().__init__()
@@ -52,23 +52,24 @@ class Killed(BaseCallback):
         (folder,) = self.root.glob("dqn/*")
         found = RunFolder(folder).last_checkpoint()
         self.seen.add(None if found is None else int(found.name))
-        if self.num_timesteps == 150:
+        if self.num_timesteps == 30:
             raise OSError("killed")
         return True
 
 
-@pytest.mark.parametrize(("seconds", "saved"), [(0.0, 149), (120.0, None)])
+@pytest.mark.parametrize(("seconds", "saved"), [(0.0, 29), (120.0, None)])
 def test_a_kill_before_the_first_evaluation_costs_two_minutes_at_most(
     tmp_path, monkeypatch, seconds, saved
 ):
-    monkeypatch.setattr(checkpoint, "SECONDS", seconds)
     killed = Killed(tmp_path)
-    with pytest.raises(OSError, match="killed"):
-        train(RUN, tmp_path, [killed])
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoint, "SECONDS", seconds)
+        with pytest.raises(OSError, match="killed"):
+            train(RUN, tmp_path, [killed])
     (folder,) = (tmp_path / "dqn").iterdir()
     found = RunFolder(folder).last_checkpoint()
     assert (None if found is None else int(found.name)) == saved
-    assert len(killed.seen) == (150 if saved else 1)
+    assert len(killed.seen) == (30 if saved else 1)
     assert resume(folder).finished
     evaluations = np.load(folder / "evaluations.npz")
     assert evaluations["timesteps"].tolist() == [200, 400, 600, 800]

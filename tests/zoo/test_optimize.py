@@ -12,7 +12,7 @@ ENVS = {"dqn": "CartPole-v1", "sac": "Pendulum-v1", "ppo": "CartPole-v1"}
 CLASSES = {"dqn": DQN, "sac": SAC, "ppo": PPO}
 CONFIG = """
 {env}:
-  n_timesteps: 300
+  n_timesteps: 120
   policy: sb3_sparse.SparsePolicy
   policy_kwargs:
     sparsity: 0.3
@@ -30,7 +30,7 @@ def optimize(algo, config, cwd, *more):
     command = [
         sys.executable, "-m", "rl_zoo3.train", "--algo", algo, "--env", ENVS[algo],
         "--conf-file", "config.yml", "-optimize", "--n-trials", "2", "--n-evaluations", "1",
-        "--eval-episodes", "1", "-n", "300", "--no-optim-plots", "--seed", "1",
+        "--eval-episodes", "1", "-n", "120", "--no-optim-plots", "--seed", "1",
         "--optimization-log-path", "trials", *more,
     ]  # fmt: skip
     return subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=False)
@@ -59,7 +59,7 @@ def test_without_it_the_sparsity_is_missed_and_a_stock_policy_is_left_alone(tmp_
     assert done.returncode != 0
     assert "a sparse policy needs its sparsity" in done.stderr
     assert "add --gym-packages sb3_sparse.rl_zoo_optimize" in done.stderr
-    stock = "CartPole-v1:\n  n_timesteps: 300\n  policy: MlpPolicy\n"
+    stock = "CartPole-v1:\n  n_timesteps: 120\n  policy: MlpPolicy\n"
     stock += "  policy_kwargs: {net_arch: [17], normalize_images: False}\n"
     done = optimize("dqn", stock, tmp_path, "--gym-packages", "sb3_sparse.rl_zoo_optimize")
     assert done.returncode == 0, done.stderr
