@@ -48,18 +48,29 @@ def distributions_check_their_arguments(monkeypatch):
 
 
 @pytest.fixture
-def mistake(tmp_path, monkeypatch, capsys):
-    """Runs a command that must end with an error of the user's, and gives its one line."""
+def sb3_sparse(tmp_path, monkeypatch, capsys):
+    """Runs a command in the test's folder, and gives its exit code and what it printed."""
 
-    def call(*args: str) -> str:
+    def call(*args: str) -> tuple[int, str, str]:
         from sb3_sparse.cli import main
 
         monkeypatch.chdir(tmp_path)
         monkeypatch.setattr(sys, "argv", ["sb3-sparse", *args])
         with pytest.raises(SystemExit) as ended:
             main()
-        assert ended.value.code == 2
-        (line,) = capsys.readouterr().err.strip().splitlines()
+        return ended.value.code, *capsys.readouterr()
+
+    return call
+
+
+@pytest.fixture
+def mistake(sb3_sparse):
+    """Runs a command that must end with an error of the user's, and gives its one line."""
+
+    def call(*args: str) -> str:
+        code, _, errors = sb3_sparse(*args)
+        assert code == 2
+        (line,) = errors.strip().splitlines()
         assert line.startswith("Error: ")
         return line
 

@@ -23,20 +23,6 @@ from sb3_sparse.cli import main
 QUICK = ["--hyperparams", "net_arch:[24,24]", "batch_size:16"]
 
 
-@pytest.fixture
-def sb3_sparse(tmp_path, monkeypatch, capsys):
-    """Runs a command in the test's folder, and gives its exit code and what it printed."""
-
-    def call(*args: str) -> tuple[int, str, str]:
-        monkeypatch.chdir(tmp_path)
-        monkeypatch.setattr(sys, "argv", ["sb3-sparse", *args])
-        with pytest.raises(SystemExit) as ended:
-            main()
-        return ended.value.code, *capsys.readouterr()
-
-    return call
-
-
 def test_train_says_what_it_does_and_enjoy_and_inspect_read_it(tmp_path, sb3_sparse):
     evaluation = ["--eval-freq", "500", "--eval-episodes", "2"]
     run = ["--env", "CartPole-v1", "-n", "1500", "--seed", "3"]

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-
 import pytest
 import yaml
 
@@ -25,33 +22,26 @@ CELLS = {
 }
 
 
-def call(*args, cwd):
-    command = [sys.executable, "-c", "from sb3_sparse.cli import main; main()", *args]
-    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=400)
-
-
-def test_a_study_of_ones_own_is_run_looked_at_and_reported(tmp_path):
+def test_a_study_of_ones_own_is_run_looked_at_and_reported(tmp_path, sb3_sparse):
     (tmp_path / "mine.yml").write_text(yaml.safe_dump(CELLS))
     which = ["mine.yml", "--scale", "smoke"]
-    waiting = call("study", "status", *which, cwd=tmp_path)
-    assert "0 done, 0 diverged, 0 running, 0 stopped, 0 failed, 2 waiting" in waiting.stdout, (
-        waiting.stderr
-    )
+    _, said, errors = sb3_sparse("study", "status", *which)
+    assert "0 done, 0 diverged, 0 running, 0 stopped, 0 failed, 2 waiting" in said, errors
 
-    done = call("study", "run", *which, "--workers", "2", cwd=tmp_path)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "2 of 2 runs are done" in done.stdout
-    assert "Report on them with: sb3-sparse study report mine.yml --scale smoke" in done.stdout
+    code, said, errors = sb3_sparse("study", "run", *which, "--workers", "2")
+    assert code == 0, said + errors
+    assert "2 of 2 runs are done" in said
+    assert "Report on them with: sb3-sparse study report mine.yml --scale smoke" in said
     assert len(list((tmp_path / "studies/runs/dqn").iterdir())) == 2
 
-    again = call("study", "run", *which, cwd=tmp_path)
-    assert "2 of 2 runs are already done" in again.stdout
-    assert "left" not in again.stdout  # nothing was run
+    _, said, _ = sb3_sparse("study", "run", *which)
+    assert "2 of 2 runs are already done" in said
+    assert "left" not in said  # nothing was run
 
-    report = call("study", "report", *which, cwd=tmp_path)
-    assert report.returncode == 0, report.stderr
+    code, said, errors = sb3_sparse("study", "report", *which)
+    assert code == 0, errors
     page = tmp_path / "studies/mine/smoke/index.html"
-    assert f"Written: {page.relative_to(tmp_path)}" in report.stdout
+    assert f"Written: {page.relative_to(tmp_path)}" in said
     assert "Two ways to train CartPole (smoke)" in page.read_text()
     assert (page.parent / "figures/curves.csv").is_file()
 

@@ -261,5 +261,6 @@ def save(name: str, drawing: Drawing, folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     with written_whole(folder / f"{name}.svg") as new:
         new.write_bytes(svg_of(drawing.figure))
+    drawing.figure.set_layout_engine(None)  # its panels stay where the SVG has them
     save_png(folder / f"{name}.png", drawing.figure)
     write_csv(folder / f"{name}.csv", drawing.heads, drawing.rows, digits=8)

@@ -139,34 +139,38 @@ def test_a_dense_zip_cannot_hold_networks_of_this_package(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("policy", ["SparsePolicy", "SparseSimbaPolicy"])
-def test_two_exports_of_a_model_are_the_same_to_the_byte(policy, tmp_path):
-    arguments = dict(learning_rate=lambda progress: 1e-3, tensorboard_log=str(tmp_path / "tb"))
-    model = make("PPO", policy=policy, **arguments)
-    model.learn(64)
-    model.save(tmp_path / "model.zip")
-    code = """
-import sb3_sparse, sys
+def test_two_exports_of_a_model_are_the_same_to_the_byte(tmp_path):
+    formats = {
+        "SparsePolicy": FORMATS,
+        "SparseSimbaPolicy": [to for to in FORMATS if to != "dense"],
+    }
+    for policy in formats:
+        arguments = dict(learning_rate=lambda progress: 1e-3, tensorboard_log=str(tmp_path / "tb"))
+        make("PPO", policy=policy, **arguments).learn(64).save(tmp_path / f"{policy}.zip")
+    code = f"""
+import sb3_sparse
 from stable_baselines3 import PPO
 from sb3_sparse.export import export_policy
-model = PPO.load("../model.zip")
-for to in sys.argv[1:]:
-    export_policy(model, to, to)
+for policy, formats in {formats!r}.items():
+    model = PPO.load(f"../{{policy}}.zip")
+    for to in formats:
+        export_policy(model, f"{{policy}}/{{to}}", to)
 """
-    formats = [to for to in FORMATS if to != "dense" or policy == "SparsePolicy"]
     for seed in "12":
-        (tmp_path / seed).mkdir()
+        for policy in formats:
+            (tmp_path / seed / policy).mkdir(parents=True)
         environment = {**os.environ, "PYTHONHASHSEED": seed, "OMP_NUM_THREADS": "1"}
-        command = [sys.executable, "-c", code, *formats]
+        command = [sys.executable, "-c", code]
         subprocess.run(command, cwd=tmp_path / seed, check=True, env=environment)
-    first, second = (sorted((tmp_path / seed).iterdir()) for seed in "12")
-    dense = ["dense.zip"] if "dense" in formats else []
-    names = ["c.c", "c.h", *dense, "numpy.npz", "numpy_policy.py", "onnx.onnx"]
-    assert [path.name for path in first] == names
-    for one, other in zip(first, second, strict=True):
-        assert one.read_bytes() == other.read_bytes(), one.name
-        for place in (tmp_path, Path(__file__).parent, sys.prefix, Path.home()):
-            assert str(place).encode() not in contents(one), (one.name, place)
+    for policy in formats:
+        first, second = (sorted((tmp_path / seed / policy).iterdir()) for seed in "12")
+        dense = ["dense.zip"] if "dense" in formats[policy] else []
+        names = ["c.c", "c.h", *dense, "numpy.npz", "numpy_policy.py", "onnx.onnx"]
+        assert [path.name for path in first] == names
+        for one, other in zip(first, second, strict=True):
+            assert one.read_bytes() == other.read_bytes(), (policy, one.name)
+            for place in (tmp_path, Path(__file__).parent, sys.prefix, Path.home()):
+                assert str(place).encode() not in contents(one), (policy, one.name, place)
 
 
 def contents(path):
