@@ -3,17 +3,25 @@
 from __future__ import annotations
 
 import re
+from functools import partial
 
 import pytest
 import yaml
-from test_cli import sb3_sparse
+from support import run_command
 
-QUICK = ["-n", "600", "--eval-freq", "100", "--eval-episodes", "1", "--method", "rigl"]
+QUICK = ["-n", "200", "--eval-freq", "100", "--eval-episodes", "1", "--method", "rigl"]
 SMALL = ["-params", "net_arch:[16]", "learning_starts:50"]
 STUDY = "dqn_CartPole-v1_rigl_0.9_mine"
 
 
-def test_tune_searches_writes_the_best_goes_on_and_reports(tmp_path):
+@pytest.fixture
+def sb3_sparse(tmp_path, monkeypatch, capsys):
+    """Runs a command in the test's folder, and gives its exit code, output and errors."""
+    monkeypatch.chdir(tmp_path)
+    return partial(run_command, monkeypatch, capsys)
+
+
+def test_tune_searches_writes_the_best_goes_on_and_reports(tmp_path, sb3_sparse):
     (tmp_path / "mine.yml").write_text("weight_decay: [0.0, 1.0e-4]\n")
     target = tmp_path / "dqn.yml"
     target.write_text(
@@ -22,9 +30,9 @@ def test_tune_searches_writes_the_best_goes_on_and_reports(tmp_path):
         "  callback: [{sb3_sparse.SparsityCallback: {method: rigl}}]\nOther-v0: {a: 1}  # stays\n"
     )
     args = ["tune", *QUICK, "--space", "mine.yml", *SMALL]
-    done = sb3_sparse(*args, "--write-into", "dqn.yml", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr + done.stdout
-    lines = done.stdout.splitlines()
+    code, said, errors = sb3_sparse(*args, "--write-into", "dqn.yml")
+    assert code == 0, errors + said
+    lines = said.splitlines()
     assert re.fullmatch(
         r"2 of 2: trial 1 score \S+, best so far \S+ \(trial [01]\); weight_decay (0|0.0001)",
         lines[1],
@@ -40,28 +48,26 @@ def test_tune_searches_writes_the_best_goes_on_and_reports(tmp_path):
     assert target.read_text().startswith("# mine\nCartPole-v1:\n  # Tuned by sb3-sparse: search ")
     assert target.read_text().endswith("Other-v0: {a: 1}  # stays\n")
 
-    done = sb3_sparse(*args, cwd=tmp_path)
-    assert done.stdout.startswith(
-        f"The search {STUDY} is finished: 2 of 2 trials are done. Nothing"
-    )
+    _, said, _ = sb3_sparse(*args)
+    assert said.startswith(f"The search {STUDY} is finished: 2 of 2 trials are done. Nothing")
 
-    done = sb3_sparse("tune", "report", STUDY, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    code, _, errors = sb3_sparse("tune", "report", STUDY)
+    assert code == 0, errors
     page = tmp_path / "logs" / "tune" / STUDY / "report.html"
     assert "the best of 2 trials scores" in page.read_text()
     assert page.with_suffix(".csv").read_text().count("\n") == 3
 
-    done = sb3_sparse(*command.split()[1:], "--eval-freq", "300", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    code, _, errors = sb3_sparse(*command.split()[1:], "--eval-freq", "100")
+    assert code == 0, errors
 
 
-def test_trials_that_fail_are_shown_and_the_exit_code_says_so(tmp_path):
+def test_trials_that_fail_are_shown_and_the_exit_code_says_so(tmp_path, sb3_sparse):
     (tmp_path / "mine.yml").write_text("env_wrapper: [null, no.such.Wrapper]\n")
-    done = sb3_sparse("tune", *QUICK, "--space", "mine.yml", *SMALL, cwd=tmp_path)
-    assert done.returncode == 1
-    assert re.search(r"trial \d failed: ConfigError: .*No module named 'no'", done.stdout)
-    assert "1 of 2 trials are done, 1 failed; the logs of the workers are in" in done.stdout
-    assert "Best: " in done.stdout
+    code, said, _ = sb3_sparse("tune", *QUICK, "--space", "mine.yml", *SMALL)
+    assert code == 1
+    assert re.search(r"trial \d failed: ConfigError: .*No module named 'no'", said)
+    assert "1 of 2 trials are done, 1 failed; the logs of the workers are in" in said
+    assert "Best: " in said
 
 
 DATABASE = "postgresql://me:s3cret@127.0.0.1:9/x"

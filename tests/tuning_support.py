@@ -7,6 +7,7 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
+from sb3_sparse.launch import Launcher, TaskResult
 from sb3_sparse.tuning import Space
 from sb3_sparse.tuning.backend import TrialState, optuna
 from sb3_sparse.tuning.objective import planned_evaluations
@@ -14,6 +15,24 @@ from sb3_sparse.tuning.search import Search
 from sb3_sparse.tuning.tuner import define
 from sb3_sparse.zoo.results import score_of
 from sb3_sparse.zoo.spec import RunSpec
+
+
+class NoWorkers(Launcher):
+    """Runs nothing, so that a study is made and left."""
+
+    def run(self, tasks, workers):
+        yield from ()
+
+
+class Here(Launcher):
+    """Runs the tasks in this process."""
+
+    def run(self, tasks, workers):
+        for task in tasks:
+            try:
+                yield TaskResult(task, value=task())
+            except Exception as error:
+                yield TaskResult(task, error=f"Traceback:\n{error}")
 
 
 def small_run(**changes) -> RunSpec:

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 from statistics import fmean
 
 import numpy as np
 import pytest
+from forks import run_in_forks
 from stable_baselines3 import DQN
-from tuning_support import choices, small_run
+from tuning_support import Here, choices, small_run
 
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.tuning import Objective, Space, tune
@@ -46,7 +45,7 @@ def test_a_score_is_the_mean_of_the_last_tenth(returns, score):
 
 def test_a_trial_is_the_mean_score_of_its_seeds(tmp_path):
     study = optuna.create_study(direction="maximize")
-    run = small_run(n_timesteps=1200, seed=5)
+    run = small_run(n_timesteps=240, eval_freq=20, seed=5)
     study.optimize(Objective(run, choices(weight_decay=[1e-4]), 2, tmp_path), n_trials=1)
     (trial,) = study.trials
     first, second = evaluations(tmp_path / "0")
@@ -125,12 +124,13 @@ def test_one_worker_with_the_same_seed_makes_the_same_trials(tmp_path, sampler):
 
     def trials(folder, name):
         tuned = tune(
-            small_run(seed=3),
+            small_run(seed=3, n_timesteps=300),
             space,
             trials=3,
             sampler=sampler,
             log_folder=tmp_path / folder,
             name=name,
+            launcher=Here(),
         )
         return [(t.params, t.values, t.intermediate_values) for t in tuned.study.trials]
 
@@ -247,10 +247,12 @@ def test_an_environment_that_does_not_work_is_found_before_any_worker(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("missing", ["optuna", "ruamel.yaml", "matplotlib"])
-def test_a_missing_extra_names_its_cure(missing):
-    hidden = f"import sys; sys.modules[{missing!r}] = None"
-    code = f"{hidden}\nfrom sb3_sparse.tuning import tune, write_report"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert done.returncode == 1
-    assert "sb3-sparse[" in done.stderr.splitlines()[-1]
+MISSING = ["optuna", "ruamel.yaml", "matplotlib"]
+
+
+def test_a_missing_extra_names_its_cure(tmp_path):
+    code = "sys.modules[{!r}] = None\nfrom sb3_sparse.tuning import tune, write_report"
+    forks = run_in_forks("import sb3_sparse", [code.format(name) for name in MISSING], tmp_path)
+    for name, done in zip(MISSING, forks, strict=True):
+        assert done.code == 1, name
+        assert "sb3-sparse[" in done.err.splitlines()[-1], name

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import yaml
 from rich.console import Console
-from tuning_support import choices, searched, small_run
+from tuning_support import Here, choices, searched, small_run
 
 from sb3_sparse.cli.progress.tune import TuningProgress
 from sb3_sparse.errors import ConfigError
@@ -213,7 +213,8 @@ def test_the_last_attempt_at_a_planned_trial_counts(storage):
 
 
 def test_tune_is_one_call(tmp_path):
-    tuned = tune(small_run(), choices(weight_decay=[0.0]), log_folder=tmp_path)
+    run, space = small_run(n_timesteps=200), choices(weight_decay=[0.0])
+    tuned = tune(run, space, log_folder=tmp_path, launcher=Here())
     assert tuned.best.params == {"weight_decay": 0.0}
     assert tuned.config == tmp_path / "tune" / "dqn_CartPole-v1_rigl_0.9_small" / "best.yml"
     assert tuned.errors == {}

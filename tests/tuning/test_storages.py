@@ -12,7 +12,7 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
-from tuning_support import choices, small_run
+from tuning_support import Here, choices, small_run
 
 from sb3_sparse.errors import ConfigError
 from sb3_sparse.tuning import tune
@@ -124,7 +124,8 @@ def test_a_sign_of_life_that_the_database_refuses_ends_no_trial(tmp_path, monkey
 def test_sqlite_trains_a_study_to_its_end(tmp_path):
     url = f"sqlite:///{tmp_path}/studies.db"
     space = choices(weight_decay=[0.0])
-    tuned = tune(small_run(), space, storage=url, log_folder=tmp_path, heartbeat=1)
+    run = small_run(n_timesteps=200)
+    tuned = tune(run, space, storage=url, log_folder=tmp_path, heartbeat=1)
     assert tuned.status.finished
     with sqlite3.connect(tmp_path / "studies.db") as database:
         assert database.execute("select count(*) from trials").fetchone() == (1,)
@@ -214,10 +215,11 @@ def test_looking_at_a_study_writes_nothing_but_the_report(tmp_path):
     (tmp_path / "kept").mkdir()
     for storage in (None, url):
         tune(
-            small_run(),
+            small_run(n_timesteps=200),
             choices(weight_decay=[0.0]),
             name="study",
             storage=storage,
+            launcher=Here(),
             log_folder=tmp_path / "kept",
         )
     journal = tmp_path / "kept" / "tune" / "journal.log"

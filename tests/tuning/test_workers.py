@@ -13,7 +13,8 @@ from collections import Counter
 from itertools import product
 
 import pytest
-from tuning_support import choices, small_run
+from support import run_command
+from tuning_support import Here, NoWorkers, choices, small_run
 
 from sb3_sparse.errors import ConfigError, TuningFailed
 from sb3_sparse.launch import Launcher, TaskResult
@@ -39,7 +40,10 @@ def states(study) -> Counter[str]:
 
 
 @pytest.mark.parametrize("kind", ["journal", "postgres"])
-def test_four_workers_two_of_them_killed_complete_every_cell_once(kind, tmp_path, request):
+def test_four_workers_two_of_them_killed_complete_every_cell_once(
+    kind, tmp_path, request, monkeypatch
+):
+    monkeypatch.setattr("sb3_sparse.launch.local.POLL_SECONDS", 0.1)
     storage = request.getfixturevalue("postgres") if kind == "postgres" else None
     killed: dict[int, int] = {}
 
@@ -54,7 +58,7 @@ def test_four_workers_two_of_them_killed_complete_every_cell_once(kind, tmp_path
                 killed[pid] = trial.number
 
     tuned = tune(
-        small_run(n_timesteps=3000),
+        small_run(n_timesteps=1500),
         choices(**GRID),
         storage=storage,
         log_folder=tmp_path,
@@ -76,17 +80,10 @@ def test_four_workers_two_of_them_killed_complete_every_cell_once(kind, tmp_path
     assert folders == {str(trial.number) for trial in done}
     assert tuned.status.finished
 
-    more = tune(small_run(n_timesteps=3000), choices(**GRID), storage=storage, log_folder=tmp_path)
+    more = tune(small_run(n_timesteps=1500), choices(**GRID), storage=storage, log_folder=tmp_path)
     assert not more.began
     assert len(more.study.get_trials()) == 8
     assert more.best.params == tuned.best.params
-
-
-class NoWorkers(Launcher):
-    """Runs nothing, so that a study is made and left."""
-
-    def run(self, tasks, workers):
-        yield from ()
 
 
 def made(tmp_path, space=None, **options):
@@ -130,8 +127,8 @@ def test_a_trial_is_stale_after_three_missing_signs_and_waits_again(tmp_path):
     assert states(study) == {"FAIL": 1, "WAITING": 6}
 
 
-def test_an_interrupted_study_goes_on_with_the_same_command(tmp_path):
-    args = ["-n", "4000", "--eval-freq", "200", "--eval-episodes", "1", "--workers", "1"]
+def test_an_interrupted_study_goes_on_with_the_same_command(tmp_path, monkeypatch, capsys):
+    args = ["-n", "3000", "--eval-freq", "200", "--eval-episodes", "1", "--workers", "1"]
     args += ["--space", "space.yml", "-params", "net_arch:[16]", "learning_starts:50"]
     (tmp_path / "space.yml").write_text("weight_decay: [0.0, 1.0e-4]\n")
     code = "from sb3_sparse.cli import main; main()"
@@ -161,10 +158,9 @@ def test_an_interrupted_study_goes_on_with_the_same_command(tmp_path):
     assert found["RUNNING"] == 0
     assert found["WAITING"] == 2 - found["COMPLETE"]
 
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
-    assert f"Search {name}: 2 of 2 trials are done." in done.stdout
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
-    assert f"The search {name} is finished: 2 of 2 trials are done. Nothing to do." in done.stdout
+    monkeypatch.chdir(tmp_path)
+    _, said, _ = run_command(monkeypatch, capsys, "tune", *args)
+    assert f"Search {name}: 2 of 2 trials are done." in said
     assert states(study)["COMPLETE"] == 2
 
 
@@ -180,17 +176,6 @@ def test_trials_that_fail_are_noted_and_tried_again_by_the_next_command(tmp_path
     assert all("No module named 'no'" in trial.user_attrs["error"] for trial in status.failed)
     made(tmp_path, space)
     assert states(study) == {"COMPLETE": 1, "FAIL": 2, "WAITING": 2}
-
-
-class Here(Launcher):
-    """Runs the tasks in this process."""
-
-    def run(self, tasks, workers):
-        for task in tasks:
-            try:
-                yield TaskResult(task, value=task())
-            except Exception as error:
-                yield TaskResult(task, error=f"Traceback:\n{error}")
 
 
 @pytest.mark.parametrize("trials", [2, 5])  # a worker gives up after three
@@ -428,7 +413,7 @@ def test_a_lock_of_a_dead_process_is_taken_over_and_that_of_a_live_one_is_not(
 
 def test_ray_completes_every_cell_once(tmp_path):
     tuned = tune(
-        small_run(),
+        small_run(n_timesteps=200),
         choices(weight_decay=[0.0, 1e-4], update_interval=[100]),
         log_folder=tmp_path,
         workers=2,
