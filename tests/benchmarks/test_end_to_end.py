@@ -30,7 +30,7 @@ def run(*words: object) -> subprocess.CompletedProcess[str]:
     )
 
 
-def test_a_case_is_measured_from_end_to_end(tmp_path):
+def test_a_case_is_measured_from_end_to_end(tmp_path, end_to_end, monkeypatch, capsys):
     file = tmp_path / "rows.csv"
     one_round = ["--rounds", 1, "--seconds", 0.01]
     case = ["--cases", "a2c-8@CartPole-v1", "--activation", "silu", "--sparsity", 0.5]
@@ -49,7 +49,9 @@ def test_a_case_is_measured_from_end_to_end(tmp_path):
         assert 0 < float(row["act_us"]) < float(row["rollout_us"]) < step
     rates = float(ours["steps_per_second"]) / float(stock["steps_per_second"])
     assert float(ours["ratio"]) == pytest.approx(rates)
-    printed = run("--table", file).stdout.splitlines()
+    monkeypatch.setattr(sys, "argv", ["end_to_end.py", "--table", str(file)])
+    end_to_end.main()
+    printed = capsys.readouterr().out.splitlines()
     assert len(printed) == 3
     assert printed[2].startswith("| a2c-8 silu | CartPole-v1 | 50% | ")
     ratios = f" | {float(plugin['ratio']):.2f} | **{float(ours['ratio']):.2f}** | "

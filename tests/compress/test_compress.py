@@ -77,7 +77,7 @@ def test_a_guarded_search_ends_with_a_model_that_does_what_it_says(tmp_path):
         "MlpPolicy", env, n_steps=32, batch_size=256, n_epochs=10, gamma=0.98, gae_lambda=0.8,
         learning_rate=2e-3, seed=0, device="cpu", policy_kwargs=dict(net_arch=[32, 32]),
     )  # fmt: skip
-    model.learn(12_000)
+    model.learn(6_000)
     evaluation = make_vec_env("CartPole-v1", n_envs=5)
     outcome = compress_model(model, evaluation, tmp_path, max_drop=0.5, steps=2048, episodes=5)
     passed = [level for level in outcome.levels if level.verdict == "passed"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import functools
 
 import numpy as np
 import pytest
@@ -22,7 +23,13 @@ NAMES = sorted(ALGORITHMS)
 
 def trained(name, **kwargs):
     model = make(name, policy="MlpPolicy", **kwargs)
-    return model.learn(80)
+    return model.learn(40)
+
+
+@pytest.fixture(scope="module")
+def trained_once():
+    """Trained models of algorithms, for tests that only read them."""
+    return functools.cache(trained)
 
 
 def state(model) -> dict[str, th.Tensor]:
@@ -45,7 +52,7 @@ DENSE = [
 
 @pytest.mark.parametrize(("name", "policy", "kwargs"), DENSE)
 def test_every_layer_keeps_its_largest_weights_and_the_model_stays_as_it_is(name, policy, kwargs):
-    model = make(name, policy=policy, policy_kwargs=kwargs).learn(80)
+    model = make(name, policy=policy, policy_kwargs=kwargs).learn(40)
     before = state(model)
     twin = sparsify(model, 0.8)
     assert type(twin) is type(model)
@@ -66,8 +73,8 @@ def test_every_layer_keeps_its_largest_weights_and_the_model_stays_as_it_is(name
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_it_acts_as_the_dense_model_with_its_small_weights_zeroed(name, tmp_path):
-    model = trained(name)
+def test_it_acts_as_the_dense_model_with_its_small_weights_zeroed(name, trained_once, tmp_path):
+    model = trained_once(name)
     twin = sparsify(model, 0.7)
     model.save(tmp_path / "model")
     zeroed = ALGORITHMS[name].load(tmp_path / "model", device="cpu").policy
@@ -84,8 +91,8 @@ def test_it_acts_as_the_dense_model_with_its_small_weights_zeroed(name, tmp_path
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_targets_and_moments_are_the_models_where_a_connection_is_kept(name):
-    model = trained(name)
+def test_targets_and_moments_are_the_models_where_a_connection_is_kept(name, trained_once):
+    model = trained_once(name)
     before = state(model)
     twin = sparsify(model, 0.8)
     names = {id(module): name for name, module in twin.policy.named_modules()}
@@ -131,8 +138,8 @@ def test_it_is_saved_loaded_copied_and_trained_on(name, tmp_path):
     masks = [layer.mask() for layer in twin.policy.sparse.layers]
     before = [layer.dense().copy() for layer in twin.policy.sparse.layers]
     steps = twin.num_timesteps
-    twin.learn(80, reset_num_timesteps=False)
-    assert twin.num_timesteps >= steps + 80
+    twin.learn(40, reset_num_timesteps=False)
+    assert twin.num_timesteps >= steps + 40
     assert_masked(twin)
     for mask, layer in zip(masks, twin.policy.sparse.layers, strict=True):
         np.testing.assert_array_equal(mask, layer.mask())

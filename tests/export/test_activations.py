@@ -80,27 +80,30 @@ def test_each_format_computes_what_torch_does(name, image):
         assert apart.max() < 2e-6
 
 
-@pytest.mark.parametrize(
-    "activation",
-    [
-        nn.GELU,
-        partial(nn.GELU, approximate="tanh"),
-        nn.Mish,
-        partial(nn.Softplus, beta=2.0, threshold=3.0),
-        nn.PReLU,
-        nn.Hardswish,
-        nn.SELU,
-        partial(nn.CELU, alpha=0.5),
-        nn.LogSigmoid,
-        nn.Tanhshrink,
-    ],
-    ids=["GELU", "tanh", "Mish", "Softplus", "PReLU", "Hardswish", "SELU", "CELU", "LogS", "Tanhs"],
-)
-@pytest.mark.parametrize(("algorithm", "to"), [
-    ("SAC", "c"), ("PPO", "numpy"), ("TD3", "onnx"), ("DQN", "dense"), ("QRDQN", "c")
-])  # fmt: skip
-def test_whole_policies_act_as_the_model(activation, algorithm, to, tmp_path):
-    kwargs = dict(activation_fn=activation, sparsity=0.5)
+POLICIES = [("SAC", "c"), ("PPO", "numpy"), ("TD3", "onnx"), ("DQN", "dense"), ("QRDQN", "c")]
+OF_POLICIES = {
+    "GELU": nn.GELU,
+    "tanh": partial(nn.GELU, approximate="tanh"),
+    "Mish": nn.Mish,
+    "Softplus": partial(nn.Softplus, beta=2.0, threshold=3.0),
+    "PReLU": nn.PReLU,
+    "Hardswish": nn.Hardswish,
+    "SELU": nn.SELU,
+    "CELU": partial(nn.CELU, alpha=0.5),
+    "LogSigmoid": nn.LogSigmoid,
+    "Tanhshrink": nn.Tanhshrink,
+}
+PAIRS = [
+    (name, *POLICIES[(number + further) % len(POLICIES)])
+    for number, name in enumerate(OF_POLICIES)
+    for further in (0, 1)
+]
+"""Each activation in two policies: what a format makes of it alone is tested above."""
+
+
+@pytest.mark.parametrize(("name", "algorithm", "to"), PAIRS)
+def test_whole_policies_act_as_the_model(name, algorithm, to, tmp_path):
+    kwargs = dict(activation_fn=OF_POLICIES[name], sparsity=0.5)
     model = make(algorithm, policy_kwargs=kwargs)
     for parameter in model.policy.parameters():
         parameter.data.mul_(1.5)

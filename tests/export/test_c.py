@@ -2,6 +2,7 @@
 
 import re
 import subprocess
+from itertools import product
 
 import numpy as np
 import pytest
@@ -48,11 +49,7 @@ def models():
 
 
 KINDS = ["vectors", "dense", "images", "residual", "simba"]
-
-
-def some(model):
-    """A few observations of a model."""
-    return random_observations(model.observation_space, None, 20)
+WIDTHS = [False, True, "full"]
 
 
 def works(*options):
@@ -62,22 +59,33 @@ def works(*options):
     return subprocess.run(command, input=code, text=True, capture_output=True).returncode == 0
 
 
+@pytest.fixture(scope="module")
+def written(models, tmp_path_factory):
+    """Reports and files of each policy at each width of its weights."""
+    found = {}
+    for kind, int8 in product(KINDS, WIDTHS):
+        path = tmp_path_factory.mktemp("written") / "policy"
+        seen = random_observations(models[kind].observation_space, None, 20)
+        report = export_policy(models[kind], path, int8=int8, observations=seen)
+        found[kind, int8] = report, path.with_suffix(".c")
+    return found
+
+
 @pytest.mark.parametrize("options", [["-O2"], ["-O3", "-Wconversion"], ["-m32", "-O2"]], ids=str)
-@pytest.mark.parametrize("int8", [False, True, "full"])
+@pytest.mark.parametrize("int8", WIDTHS)
 @pytest.mark.parametrize("kind", KINDS)
-def test_no_compiler_warns(models, kind, int8, options, tmp_path):
+def test_no_compiler_warns(written, kind, int8, options):
     if not works(*options):
         pytest.skip(f"the compiler cannot {options[0]} here (Debian: gcc-multilib)")
-    export_policy(models[kind], tmp_path / "policy", int8=int8, observations=some(models[kind]))
-    assert compiles(tmp_path / "policy.c", *options) == ""
+    _, path = written[kind, int8]
+    assert compiles(path, *options) == ""
 
 
-@pytest.mark.parametrize("int8", [False, True, "full"])
+@pytest.mark.parametrize("int8", WIDTHS)
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_file_states_its_flash_and_ram(models, kind, int8, tmp_path):
-    seen = some(models[kind])
-    report = export_policy(models[kind], tmp_path / "policy", int8=int8, observations=seen)
-    source = (tmp_path / "policy.c").read_text()
+def test_the_file_states_its_flash_and_ram(written, kind, int8):
+    report, path = written[kind, int8]
+    source = path.read_text()
     arrays = re.findall(r"static const (\w+) \w+\[(\d+)\] = \{(.*?)\}", source, re.S)
     assert all(len(numbers.split(",")) == int(size) for _, size, numbers in arrays)
     flash = sum(BYTES[name] * int(size) for name, size, _ in arrays)

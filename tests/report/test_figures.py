@@ -134,8 +134,9 @@ def texts_of(figure):
 
 @pytest.mark.parametrize("name", ["curves", "parameters", "noise", "iqm", "improvement"])
 def test_below_five_seeds_each_is_drawn_and_from_five_on_a_band(folders, tmp_path, name):
-    few = draw(name, many(folders, 4))
-    more = draw(name, many(type(folders)(tmp_path / "more"), 5))
+    labels = ["dense", "equal", "static", "rigl"]
+    few = draw(name, many(folders, 4, labels))
+    more = draw(name, many(type(folders)(tmp_path / "more"), 5, labels))
     assert not any(marked(axes, BAND) for axes in few.figure.axes)
     assert all(marked(axes, BAND) for axes in more.figure.axes)
     assert not any(marked(axes, SEED) for axes in more.figure.axes)
