@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import doctest
 import inspect
+import io
 import os
 import re
 import shlex
@@ -11,6 +12,7 @@ import shutil
 import subprocess
 import sys
 import textwrap
+from contextlib import redirect_stdout
 from importlib import import_module
 from itertools import takewhile
 from pathlib import Path
@@ -116,8 +118,16 @@ def flown(tmp_path_factory):
     shutil.copytree(ROOT / "examples/microcontroller", folder / "examples/microcontroller")
     _, *steps, _ = tutorial_steps()
     assert "".join(steps).count("-n 5000") == 1
-    said = shell("".join(steps).replace("-n 5000", "-n 300 --eval-episodes 2"), folder)
-    return folder, said
+    commands = "".join(steps).replace("-n 5000", "-n 300 --eval-episodes 2")
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(io.StringIO()) as said:
+        patch.chdir(folder)
+        patch.syspath_prepend(folder)
+        for line in commands.replace("\\\n", " ").splitlines():
+            if line.startswith("sb3-sparse"):
+                cli.app(shlex.split(line)[1:], standalone_mode=False)
+            else:
+                print(shell(line, folder))
+    return folder, said.getvalue()
 
 
 def tutorial_steps() -> list[str]:

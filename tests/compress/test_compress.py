@@ -79,7 +79,7 @@ def test_a_guarded_search_ends_with_a_model_that_does_what_it_says(tmp_path):
     )  # fmt: skip
     model.learn(6_000)
     evaluation = make_vec_env("CartPole-v1", n_envs=5)
-    outcome = compress_model(model, evaluation, tmp_path, max_drop=0.5, steps=2048, episodes=5)
+    outcome = compress_model(model, evaluation, tmp_path, max_drop=0.5, steps=512, episodes=5)
     passed = [level for level in outcome.levels if level.verdict == "passed"]
     assert passed
     for level in passed:
