@@ -60,9 +60,9 @@ def acts_elementwise(optimizer: th.optim.Optimizer) -> bool:
     start = th.linspace(-1.0, 1.0, 24).view(4, 6) * active
     try:
         with th.random.fork_rng(devices=[]):
-            th.manual_seed(0)
+            th.default_generator.manual_seed(0)
             matrix, memory = _trial(optimizer, start, lambda step: (start + step).sin() * active)
-            th.manual_seed(0)
+            th.default_generator.manual_seed(0)
             vector, _ = _trial(optimizer, start[active], lambda step: (start[active] + step).sin())
     except Exception:  # for any reason: it does not take a weight as a plain vector
         return False
