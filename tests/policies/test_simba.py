@@ -60,7 +60,7 @@ def test_training_keeps_counts_and_zeros_and_moves_masks(name, compute):
     model = simba(name, compute=compute)
     layers = list(model.policy.sparse.layers)
     before = [(layer.mask(), layer.nnz) for layer in layers]
-    model.learn(100, callback=SparsityCallback("rigl", update_interval=5))
+    model.learn(64, callback=SparsityCallback("rigl", update_interval=5))
     assert_masked(model)
     layers = list(model.policy.sparse.layers)
     assert [layer.nnz for layer in layers] == [nnz for _, nnz in before]
@@ -76,7 +76,7 @@ def test_training_keeps_counts_and_zeros_and_moves_masks(name, compute):
 @pytest.mark.parametrize("name", NAMES)
 def test_a_saved_model_acts_and_trains_as_before(name, compute, tmp_path):
     model = simba(name, compute=compute)
-    model.learn(64, callback=SparsityCallback("set", update_interval=5))
+    model.learn(40, callback=SparsityCallback("set", update_interval=4))
     model.save(tmp_path / "model")
     loaded = ALGORITHMS[name].load(tmp_path / "model", env=model.get_env())
     twin = copy.deepcopy(model.policy)
@@ -88,13 +88,13 @@ def test_a_saved_model_acts_and_trains_as_before(name, compute, tmp_path):
     assert one.keys() == two.keys()
     for key, value in one.items():
         assert th.equal(th.as_tensor(value), th.as_tensor(two[key])), key
-    loaded.learn(40, callback=SparsityCallback("set", update_interval=5))
+    loaded.learn(30, callback=SparsityCallback("set", update_interval=4))
     assert_masked(loaded)
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_equal_seeds_give_equal_runs(name):
-    models = [simba(name).learn(64) for _ in range(2)]
+    models = [simba(name).learn(40) for _ in range(2)]
     for one, two in zip(*(model.policy.parameters() for model in models), strict=True):
         assert th.equal(one, two)
 
@@ -103,7 +103,9 @@ def test_equal_seeds_give_equal_runs(name):
 @pytest.mark.parametrize("name", FUSED)
 def test_fused_steps_end_as_those_of_stock(name, method):
     for storage in STORAGES:
-        kwargs = dict(policy_kwargs_of(method, storage), net_arch=arch_of(name))
+        # Smooth: where a ReLU's input is 0 but for rounding, one of the two has no gradient.
+        smooth = dict(net_arch=arch_of(name), activation_fn=nn.SiLU)
+        kwargs = dict(policy_kwargs_of(method, storage), **smooth)
         # Where the epsilon is small, what has no gradient moves by the learning rate times noise.
         kwargs["optimizer_kwargs"] = dict(eps=1e-3)
         assert_like_stock(
@@ -340,7 +342,7 @@ def test_recycled_units_and_resets(name, compute):
         RecycleDormantCallback(5, tau=0.8, batch_size=32),
         ResetCallback(20),
     ]
-    model = simba(name, compute=compute).learn(60, callback=callbacks)
+    model = simba(name, compute=compute).learn(45, callback=callbacks)
     assert_masked(model)
     assert all(th.isfinite(parameter).all() for parameter in model.policy.parameters())
     assert model.resets_up_to >= 20
