@@ -38,7 +38,7 @@ class Ear(Logger):
         self.heard += map(str, args)
 
 
-def assert_falls_back(name, why, change=lambda model: None, env=lambda: None, steps=None, **kwargs):
+def assert_falls_back(name, why, change=lambda model: None, env=lambda: None, **kwargs):
     """Two rounds of training, since the log shall not say it again in the second."""
     models = []
     for which in (sb3_sparse, stable_baselines3):
@@ -47,7 +47,7 @@ def assert_falls_back(name, why, change=lambda model: None, env=lambda: None, st
         change(model)
         model.set_logger(Ear())
         for _ in range(2):
-            learn(model, steps=steps)
+            learn(model, steps=25)
         models.append(model)
     ours, stock = models
     assert why in reason_of(ours)
@@ -61,7 +61,7 @@ def assert_falls_back(name, why, change=lambda model: None, env=lambda: None, st
 def test_images_and_dict_observations(name, env):
     why = "CombinedExtractor" if env is TinyDicts else "NatureCNN"
     kwargs = dict(batch_size=4) if name == "DQN" else {}
-    assert_falls_back(name, why, env=env, steps=25, **kwargs)
+    assert_falls_back(name, why, env=env, **kwargs)
 
 
 @pytest.mark.parametrize("name", ["SAC", "PPO", "A2C"])

@@ -184,7 +184,7 @@ def test_callbacks_that_change_the_model(name, change, storage):
     models = []
     for library in LIBRARIES:
         model = make(library, name, policy_kwargs=dict(compute=storage))
-        models.append(learn(model, Meddler({35: change, 45: change})))
+        models.append(learn(model, Meddler({25: change, 35: change})))
     assert fused(models[0])
     assert_alike(*models)
 
@@ -212,7 +212,7 @@ def test_an_interrupted_run_goes_on(name):
     for library in LIBRARIES:
         model = make(library, name)
         with pytest.raises(Enough):
-            learn(model, Meddler({40: stop}))
+            learn(model, Meddler({30: stop}))
         models.append(more(more(model)))
     assert_alike(*models)
 
@@ -245,12 +245,12 @@ def test_equal_seeds_give_equal_runs(name):
 def test_two_threads_agree_with_one(name, storage):
     kwargs = dict(policy_kwargs=dict(compute=storage), batch_size=200)
     if name == "PPO":
-        kwargs.update(n_steps=200, n_epochs=15)
-    one = learn(make(sb3_sparse, name, **kwargs), moving("rigl"), 400 if name == "PPO" else 50)
+        kwargs.update(n_steps=200, n_epochs=5)
+    one = learn(make(sb3_sparse, name, **kwargs), moving("rigl"), 400 if name == "PPO" else 40)
     th.set_num_threads(2)
     try:
         two = make(sb3_sparse, name, **kwargs)
-        learn(two, moving("rigl"), 400 if name == "PPO" else 50)
+        learn(two, moving("rigl"), 400 if name == "PPO" else 40)
     finally:
         th.set_num_threads(1)
     assert fused(two)

@@ -1,4 +1,4 @@
-"""Thirty gradient steps of every algorithm end as those of stock SB3 with the same policy."""
+"""Gradient steps of every algorithm end as those of stock SB3 with the same policy."""
 
 from __future__ import annotations
 
@@ -26,12 +26,13 @@ def assert_networks_alike(ours, stock):
 @pytest.mark.parametrize("storage", ["masked", "sparse"])
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("name", NAMES)
-def test_thirty_gradient_steps(name, method, storage):
+def test_gradient_steps_of_every_method(name, method, storage):
     kwargs = policy_kwargs_of(method, storage)
     ours, stock = assert_like_stock(name, lambda: moving(method), policy_kwargs=kwargs)
     assert_networks_alike(ours, stock)
+    steps = 30 if name == "PPO" else 20
     for network in ours.policy.sparse.networks:
-        assert network.clock == (15 if (name, network.name) == ("TD3", "actor") else 30)
+        assert network.clock == (10 if (name, network.name) == ("TD3", "actor") else steps)
         assert (network.mask_updates > 2) == (method not in ("static", "dense"))
 
 
@@ -46,7 +47,7 @@ def test_layers_that_auto_makes_sparse(name, method):
 
 @pytest.mark.parametrize("method", ["set", "rigl", "prune", "granet"])
 @pytest.mark.parametrize("name", NAMES)
-def test_thirty_updates_move_the_same_connections(name, method):
+def test_many_updates_move_the_same_connections(name, method):
     # With SB3's epsilon all that has just grown moves by the learning rate, and is as good to drop.
     kwargs = dict(policy_kwargs_of(method), optimizer_kwargs=dict(eps=1e-2))
     ours, stock = assert_like_stock(
@@ -55,8 +56,8 @@ def test_thirty_updates_move_the_same_connections(name, method):
     assert_networks_alike(ours, stock)
     due = [[n.updates_due for n in model.policy.sparse.networks] for model in (ours, stock)]
     assert due[0] == due[1]
-    assert sum(due[0]) >= 29
-    assert ours.policy.sparse.networks[-1].mask_updates >= (3 if method == "prune" else 20)
+    assert sum(due[0]) >= 19
+    assert ours.policy.sparse.networks[-1].mask_updates >= (3 if method == "prune" else 14)
 
 
 MIXED = [
@@ -72,7 +73,7 @@ MIXED = [
 @pytest.mark.parametrize("name", [name for name in NAMES if name != "DQN"])
 def test_a_method_for_each_network(name, methods, start, storage):
     kwargs = dict(compute=storage, sparsity=0.7, initial_sparsity=start)
-    options = dict(update_interval={"actor": 3, "critic": 2}, begin=0.0, end=1.0)
+    options = dict(update_interval={"actor": 2, "critic": 3}, begin=0.0, end=1.0)
     options["update_interval"] = {
         network: options["update_interval"][network]
         for network, method in methods.items()

@@ -124,7 +124,7 @@ def test_without_checks_training_goes_on(name, monkeypatch):
 
 @pytest.mark.parametrize("name", ["SAC", "TD3", "DQN"])
 def test_rewards_that_are_not_finite(name):
-    for number in (NAN, INF, 1e30):
+    for number in (NAN, INF, 1e35):
         models = []
         for library in (sb3_sparse, stable_baselines3):
             model = learn(make(library, name, policy_kwargs=dict(sparsity=0.0)))

@@ -112,7 +112,7 @@ def test_somebody_who_wraps_a_step():
         return calls
 
     one, two = train_both(wrap)
-    assert len(one) == len(two) == 30
+    assert len(one) == len(two) == 20
 
 
 @pytest.mark.parametrize("name", ["SAC", "PPO"])
@@ -129,7 +129,7 @@ def test_hooks_of_the_users_own(name, when):
         return sums
 
     one, two = train_both(watch, name)
-    assert len(one) == 30
+    assert len(one) == (30 if name == "PPO" else 20)
     assert one == pytest.approx(two, rel=1e-3)
 
 
@@ -147,7 +147,7 @@ def test_hooks_on_all_optimizers():
         learn(make(stable_baselines3, "SAC"))
     finally:
         handle.remove()
-    assert len(calls) >= 90
+    assert len(calls) >= 60
     assert len(ours) == len(calls)
 
 

@@ -77,9 +77,9 @@ DENSE = {
 def test_per_sample_gradients_average_to_the_dense_gradient_of_sb3(name, compute, policy):
     arguments = dict(learning_rate=0.0, **STILL[name])
     sparse = make(name, policy=policy, policy_kwargs={"compute": compute}, **arguments)
-    sparse.learn(64)
+    sparse.learn(40)
     stock = make(name, **DENSE[policy], **arguments)
-    stock.learn(64)
+    stock.learn(40)
     weights = sparse.policy.state_dict()
     with th.no_grad():
         for key, parameter in stock.policy.named_parameters():
@@ -159,11 +159,11 @@ def test_training_is_the_same_with_and_without(name, package, compute, tmp_path)
     ends = []
     for watched in (False, True):
         model = make(getattr(package, name), policy_kwargs={"compute": compute})
-        callbacks = [SparsityCallback("rigl", update_interval=10)]
+        callbacks = [SparsityCallback("rigl", update_interval=5)]
         if watched:
             callbacks.append(GradientSNRCallback(32, path=tmp_path / "snr.csv"))
             callbacks.append(PlasticityCallback(32, path=tmp_path / "plasticity.csv"))
-        model.learn(128, callback=callbacks)
+        model.learn(64, callback=callbacks)
         ends.append(model.policy.state_dict())
     assert (tmp_path / "snr.csv").read_text().count("\n") > 3
     for key, value in ends[0].items():

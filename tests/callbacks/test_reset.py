@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import stable_baselines3
@@ -146,7 +147,7 @@ def test_fused_steps_go_on_from_a_reset(name, layers):
         ({"gradient_steps": 1}, 30, [10, 20]),
         ({"gradient_steps": 3}, 17, [12, 21]),  # the second is due in the last round of 7
         ({"gradient_steps": -1, "train_freq": 4}, 28, [12, 20]),
-        ({"gradient_steps": -1, "train_freq": (1, "episode")}, 400, [200, 400]),
+        ({"gradient_steps": -1, "train_freq": (1, "episode")}, 40, [20, 40]),
     ],
 )
 def test_a_resumed_training_resets_as_the_uninterrupted_one(kwargs, steps, due, tmp_path):
@@ -157,11 +158,12 @@ def test_a_resumed_training_resets_as_the_uninterrupted_one(kwargs, steps, due, 
             super().act(step)
             acted.append((step, self.model.policy.actor.latent_pi[0].weight.detach().clone()))
 
-    model = make("SAC", learning_starts=10, **kwargs)
+    env = gym.make("Pendulum-v1", max_episode_steps=20)
+    model = make("SAC", env, learning_starts=10, **kwargs)
     model.learn(2 * steps, callback=Watch(10))
     whole, acted = acted[:2], []
     assert [step for step, _ in whole] == due
-    model = make("SAC", learning_starts=10, **kwargs)
+    model = make("SAC", env, learning_starts=10, **kwargs)
     model.learn(steps, callback=Watch(10))  # none after the last step, where the second is due
     assert [step for step, _ in acted] == due[:1]
     model.save(tmp_path / "model.zip")

@@ -10,7 +10,7 @@ from sb3_sparse import SparsityCallback
 from sb3_sparse.sparsity.distributions import active_counts
 from sb3_sparse.topology import method_named, method_names
 
-STEPS = 160
+STEPS = 64
 METHODS = method_names()
 
 

@@ -91,7 +91,7 @@ def test_whoever_writes_what_is_inactive_is_zero_when_it_counts(name, write, tmp
     np.testing.assert_array_equal(loaded.predict(observation, deterministic=True)[0], acted)
     assert inactive(loaded) == 0.0
     write(model)
-    model.learn(40, callback=SparsityCallback("set", update_interval=2))
+    model.learn(30, callback=SparsityCallback("set", update_interval=2))
     assert_masked(model)
     write(model)
     model.policy.sparsity_report()
@@ -175,7 +175,7 @@ def test_an_optimizer_whose_memory_cannot_follow_says_so(name, storage):
 def test_optimizers_that_need_matrices_keep_masks(name):
     kwargs = dict(optimizer_class=th.optim.Adafactor, compute="auto")
     model = make(name, policy_kwargs=kwargs)
-    model.learn(60, callback=SparsityCallback("rigl", update_interval=4))
+    model.learn(48, callback=SparsityCallback("rigl", update_interval=4))
     assert not any(layer.is_sparse for layer in model.policy.sparse.layers)
     assert inactive(model) == 0.0
     with pytest.raises(UnsupportedError, match="Adafactor"):
@@ -245,7 +245,7 @@ def test_evolution_strategies_on_the_floats_of_a_state_dict_work(name):
 
 @pytest.mark.parametrize("name", sorted(PARTS))
 def test_a_part_is_saved_for_sb3s_own_class_and_acts_the_same(name, tmp_path):
-    model = make(name).learn(40)
+    model = make(name).learn(30)
     part = getattr(model.policy, PARTS[name])
     stock = next(c for c in type(part).__mro__ if not c.__module__.startswith("sb3_sparse"))
     part.save(tmp_path / "part.pth")
@@ -255,7 +255,7 @@ def test_a_part_is_saved_for_sb3s_own_class_and_acts_the_same(name, tmp_path):
     batch = th.as_tensor(np.stack([model.observation_space.sample() for _ in range(5)]))
     actions = [p.predict(batch.numpy(), deterministic=True)[0] for p in (part, loaded)]
     np.testing.assert_allclose(actions[0], actions[1], rtol=1e-4, atol=1e-5)
-    model.learn(40, callback=SparsityCallback("set", update_interval=2))  # it still trains
+    model.learn(30, callback=SparsityCallback("set", update_interval=2))  # it still trains
     assert_masked(model)
 
 
@@ -270,7 +270,7 @@ def test_a_part_with_other_masks_is_taken_and_its_target_follows(name):
                 weight = target.state_dict()["weight"].reshape(-1)
                 if network.name == part:
                     assert not weight[~layer.mask()].any()
-    model.learn(400 if name in DISCRETE else 60)
+    model.learn(200 if name in DISCRETE else 40)
     largest = max(float(p.abs().max()) for p in model.policy.parameters())
     assert largest < 100.0
     assert_masked(model)
@@ -286,7 +286,7 @@ def test_parameters_without_exact_match_take_what_is_there(name):
     for layer, source in zip(model.policy.sparse.layers, other.policy.sparse.layers, strict=True):
         np.testing.assert_array_equal(layer.mask(), source.mask())
         np.testing.assert_array_equal(layer.dense(), source.dense())
-    model.learn(60, callback=SparsityCallback("set", update_interval=2))
+    model.learn(40, callback=SparsityCallback("set", update_interval=2))
     assert_masked(model)
 
 
@@ -304,9 +304,9 @@ class LowersTau(BaseCallback):
     """Turns hard copies into soft ones in mid-run, and clamps all parameters now and then."""
 
     def _on_step(self) -> bool:
-        if self.num_timesteps == 200:
+        if self.num_timesteps == 100:
             self.model.tau = 0.1
-        if self.num_timesteps % 70 == 0:
+        if self.num_timesteps % 35 == 0:
             for parameter in self.model.policy.parameters():
                 parameter.data.clamp_(-1.0, 1.0)
         return True
@@ -315,7 +315,7 @@ class LowersTau(BaseCallback):
 @pytest.mark.parametrize("name", ["DQN", "QRDQN"])
 def test_targets_stay_sound_when_tau_falls_or_parameters_are_clamped(name):
     model = make(name, target_update_interval=7)
-    model.learn(400, callback=[SparsityCallback("rigl", update_interval=5), LowersTau()])
+    model.learn(200, callback=[SparsityCallback("rigl", update_interval=5), LowersTau()])
     for parameter in model.policy.parameters():
         assert float(parameter.abs().max()) < 100.0
     assert_masked(model)
@@ -329,13 +329,13 @@ def test_layers_frozen_after_construction_stay_as_they_are(name):
         layer.weight.requires_grad_(False)
     before = [(layer.dense().copy(), layer.mask()) for layer in frozen]
     copy.deepcopy(model.policy)
-    model.learn(80, callback=SparsityCallback("set", update_interval=2))
+    model.learn(40, callback=SparsityCallback("set", update_interval=2))
     for layer, (weights, mask) in zip(frozen, before, strict=True):
         np.testing.assert_array_equal(layer.mask(), mask)
         np.testing.assert_array_equal(layer.dense(), weights)
     for layer in frozen:
         layer.weight.requires_grad_(True)
-    model.learn(80, callback=SparsityCallback("set", update_interval=2))
+    model.learn(40, callback=SparsityCallback("set", update_interval=2))
     assert_masked(model)
     for layer, (weights, _) in zip(frozen, before, strict=True):
         assert (layer.dense() != weights).any()

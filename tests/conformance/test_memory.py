@@ -18,8 +18,8 @@ from sb3_sparse import SparsityCallback
 def test_a_trained_model_is_freed(algorithm, env, method):
     def train_and_forget():
         model = make(algorithm, env)
-        options = {} if method == "static" else {"update_interval": 5}
-        model.learn(100, callback=SparsityCallback(method, **options))
+        options = {} if method == "static" else {"update_interval": 2}
+        model.learn(48, callback=SparsityCallback(method, **options))
         return [weakref.ref(thing) for thing in (model, model.policy, model.get_env())]
 
     references = train_and_forget()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gymnasium as gym
 import pytest
 import torch as th
 from gymnasium import spaces
@@ -14,7 +15,7 @@ from sb3_sparse import SparseActorCriticPolicy, SparsityCallback
 from sb3_sparse.errors import UnsupportedError
 from sb3_sparse.policies.compiled import unwrapped
 
-CALLBACK = dict(update_interval=5, drop_fraction=0.5)
+CALLBACK = dict(update_interval=4, drop_fraction=0.5)
 CNN = dict(features_extractor_kwargs=dict(features_dim=16), net_arch=[16])
 DICTS = dict(features_extractor_kwargs=dict(cnn_output_dim=16), net_arch=[16])
 WITH_IMAGES = sorted(set(ALGORITHMS) - {"CrossQ"})  # which has no CNN policy in sb3-contrib
@@ -37,7 +38,7 @@ def test_images_and_dicts_get_the_extractor_of_sb3_and_train_sparsely(
 ):
     model = make(name, environment(kind, name), policy_kwargs=dict(kwargs, sparsity=0.8))
     assert model.policy.features_extractor_class is extractor
-    model.learn(64, callback=SparsityCallback("rigl", **CALLBACK))
+    model.learn(48, callback=SparsityCallback("rigl", **CALLBACK))
     assert_masked(model)
     convs = [layer for layer in model.policy.sparse.layers if len(layer.shape) == 4]
     assert convs
@@ -56,7 +57,7 @@ def test_a_shared_extractor_belongs_to_the_actor_once_and_its_targets_follow(nam
     actor, critic = model.policy.sparse.networks
     assert sum("features_extractor" in layer.name for layer in actor.layers) == 4
     assert not any("features_extractor" in layer.name for layer in critic.layers)
-    model.learn(64, callback=SparsityCallback("set", **CALLBACK))
+    model.learn(40, callback=SparsityCallback("set", **CALLBACK))
     assert actor.mask_updates > 0
     assert_masked(model)
     for layer in actor.layers:
@@ -81,7 +82,7 @@ def test_gsde_trains_and_its_free_log_std_stays_dense(name):
     names = [layer.name for layer in model.policy.sparse.layers]
     assert not any("log_std" in layer for layer in names)
     assert any(layer in ("actor.mu.0", "action_net") for layer in names)
-    model.learn(80, callback=SparsityCallback("rigl", **CALLBACK))
+    model.learn(48, callback=SparsityCallback("rigl", **CALLBACK))
     assert_masked(model)
 
 
@@ -96,7 +97,7 @@ def test_every_critic_has_its_own_mask_and_the_same_counts(name):
             assert other.nnz == first.nnz
             if first.nnz < first.size:
                 assert (other.mask() != first.mask()).any()
-    model.learn(60, callback=SparsityCallback("set", **CALLBACK))
+    model.learn(40, callback=SparsityCallback("set", **CALLBACK))
     assert_masked(model)
 
 
@@ -108,6 +109,7 @@ def test_several_environments(name):
     assert_masked(model)
 
 
+@pytest.mark.parametrize("storage", ["sparse"], indirect=True)  # environments know of none
 def test_subprocess_environments_and_vec_normalize():
     env = VecNormalize(make_vec_env("Pendulum-v1", n_envs=2, vec_env_cls=SubprocVecEnv))
     model = make("PPO", env)
@@ -118,8 +120,10 @@ def test_subprocess_environments_and_vec_normalize():
 
 @pytest.mark.parametrize("name", ["SAC", "TD3", "TQC", "DQN", "QRDQN"])
 def test_as_many_gradient_steps_as_environment_steps_and_whole_episodes(name):
-    model = make(name, train_freq=(1, "episode"), gradient_steps=-1)
-    model.learn(250, callback=SparsityCallback("rigl", **CALLBACK))
+    env_id = "CartPole-v1" if name in DISCRETE else "Pendulum-v1"
+    env = gym.make(env_id, max_episode_steps=30)
+    model = make(name, env, train_freq=(1, "episode"), gradient_steps=-1)
+    model.learn(90, callback=SparsityCallback("rigl", **CALLBACK))
     assert all(network.clock >= 30 for network in model.policy.sparse.networks[-1:])
     assert_masked(model)
 
@@ -127,10 +131,10 @@ def test_as_many_gradient_steps_as_environment_steps_and_whole_episodes(name):
 @pytest.mark.parametrize("name", sorted(ALGORITHMS))
 def test_set_env_and_predict(name):
     model = make(name)
-    model.learn(60, callback=SparsityCallback("set", **CALLBACK))
+    model.learn(48, callback=SparsityCallback("set", **CALLBACK))
     env_id = "CartPole-v1" if name in DISCRETE else "Pendulum-v1"
     model.set_env(make_vec_env(env_id, n_envs=model.n_envs))
-    model.learn(60, callback=SparsityCallback("set", **CALLBACK))
+    model.learn(48, callback=SparsityCallback("set", **CALLBACK))
     assert_masked(model)
     observation = model.env.reset()
     action, _ = model.predict(observation, deterministic=True)
@@ -184,7 +188,7 @@ def test_an_algorithm_without_a_sparse_policy_says_so_for_the_class_too(algorith
 def test_the_callback_works_on_a_compiled_policy(name):
     model = make(name)
     model.policy = th.compile(model.policy, backend="eager")
-    model.learn(70, callback=SparsityCallback("set", update_interval=2))
+    model.learn(48, callback=SparsityCallback("set", update_interval=2))
     assert model.policy.sparse.networks[0].mask_updates
     model.policy = unwrapped(model.policy)
     assert_masked(model)

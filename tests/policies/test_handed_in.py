@@ -60,7 +60,7 @@ def test_what_was_handed_in_stays_as_it_was(name, compute, tmp_path):
     )
     models = [make(name, policy_kwargs=copy.copy(kwargs), seed=seed) for seed in (0, 1)]
     for model in models:
-        model.learn(40, callback=SparsityCallback("set", update_interval=3))
+        model.learn(30, callback=SparsityCallback("set", update_interval=2))
         assert_masked(model)
     assert [type(module) for module in given.modules()] == types
     assert list(given.state_dict()) == list(before)

@@ -61,13 +61,13 @@ def assert_same(one: dict, two: dict) -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_a_saved_model_comes_back_as_it_was_and_trains_on(name, tmp_path):
     model = make(name, policy_kwargs=dict(weight_decay=1e-4))
-    model.learn(80, callback=rigl())
+    model.learn(40, callback=rigl(update_interval=4))
     model.save(tmp_path / "model")
     loaded = ALGORITHMS[name].load(tmp_path / "model", env=model.env, device="cpu")
     assert_same(state_of(model), state_of(loaded))
-    loaded.learn(80, callback=rigl(), reset_num_timesteps=False)
+    loaded.learn(40, callback=rigl(update_interval=4), reset_num_timesteps=False)
     assert_masked(loaded)
-    assert loaded.num_timesteps >= 160
+    assert loaded.num_timesteps >= 80
     for before, after in zip(
         model.policy.sparse.networks, loaded.policy.sparse.networks, strict=True
     ):
@@ -77,7 +77,7 @@ def test_a_saved_model_comes_back_as_it_was_and_trains_on(name, tmp_path):
 @pytest.mark.parametrize("name", NAMES)
 def test_a_saved_policy_comes_back_as_it_was(name, tmp_path):
     model = make(name, policy_kwargs=dict(dense_layers=["output"], weight_decay=1e-4))
-    model.learn(60, callback=rigl())
+    model.learn(40, callback=rigl(update_interval=4))
     model.policy.save(tmp_path / "policy.pth")
     loaded = type(model.policy).load(tmp_path / "policy.pth", device="cpu")
     for key, value in model.policy.state_dict().items():
@@ -114,13 +114,13 @@ def test_a_saved_policy_with_a_shared_extractor_comes_back(name, compute, tmp_pa
 )
 def test_a_deep_copy_trains_sparsely_and_leaves_the_original_alone(name, use_sde):
     model = make(name, **({"use_sde": True} if use_sde else {}))
-    model.learn(60, callback=rigl())
+    model.learn(40, callback=rigl(update_interval=4))
     before = state_of(model)
     twin = copy.deepcopy(model.policy)
     original, model.policy = model.policy, twin
     if hasattr(model, "_create_aliases"):
         model._create_aliases()
-    model.learn(60, callback=rigl())
+    model.learn(40, callback=rigl(update_interval=4))
     assert_masked(model)
     clocks = [network.clock for network in twin.sparse.networks]
     assert all(new > old for new, old in zip(clocks, before["clocks"], strict=True))
