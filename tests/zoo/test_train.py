@@ -26,9 +26,9 @@ from sb3_sparse.zoo.training import resume, train
 from sb3_sparse.zoo.watch import Watch
 
 SMALL = {"net_arch": [16, 16], "batch_size": 16}
-QUICK = dict(eval_freq=200, eval_episodes=2)
+QUICK = dict(eval_freq=100, eval_episodes=2)
 DQN_RUN = RunSpec(
-    n_timesteps=1000,
+    n_timesteps=500,
     hyperparams={**SMALL, "learning_starts": 50, "update_interval": 20},
     **QUICK,
 )
@@ -36,10 +36,10 @@ PPO_RUN = RunSpec(
     algo="ppo",
     env_id="Pendulum-v1",
     method="set",
-    n_timesteps=1024,
+    n_timesteps=512,
     hyperparams={
         "net_arch": {"pi": [8, 8], "vf": [8, 8]},
-        "n_steps": 128,
+        "n_steps": 64,
         "update_interval": 20,
         "drop_fraction": 0.3,
     },
@@ -66,10 +66,38 @@ def evaluations(folder):
         return saved["timesteps"].tolist(), saved["results"]
 
 
-def test_the_folder_is_the_zoos_plus_sparsity_json(tmp_path):
-    outcome = train(DQN_RUN, tmp_path)
-    folder = tmp_path / "dqn" / "CartPole-v1_1"
-    assert outcome.folder == folder
+class Seen(Watch):
+    """Notes what a run tells."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.folders, self.evaluations, self.episodes = [], [], []
+
+    def begins(self, folder, match) -> None:
+        self.folders.append((folder, match))
+
+    def evaluated(self, step, mean, std, best) -> None:
+        self.evaluations.append((step, mean, std, best))
+
+    def plays(self, what, done, planned) -> None:
+        self.episodes.append((what, done, planned))
+
+
+@pytest.fixture(scope="module")
+def seen():
+    """What the finished run told."""
+    return Seen()
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory, seen):
+    """The outcome of a run that nothing interrupts."""
+    return train(DQN_RUN, tmp_path_factory.mktemp("logs"), watch=seen)
+
+
+def test_the_folder_is_the_zoos_plus_sparsity_json(finished):
+    folder = finished.folder
+    assert folder.parts[-2:] == ("dqn", "CartPole-v1_1")
     assert sorted(str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()) == [
         "0.monitor.csv",
         "CartPole-v1.zip",
@@ -81,24 +109,23 @@ def test_the_folder_is_the_zoos_plus_sparsity_json(tmp_path):
         "sparsity.json",
     ]
     timesteps, results = evaluations(folder)
-    assert timesteps == [200, 400, 600, 800, 1000]
+    assert timesteps == [100, 200, 300, 400, 500]
     assert results.shape == (5, 2)
 
 
-def test_sparsity_json_says_what_was_trained_and_how_sparse_it_is(tmp_path):
-    outcome = train(DQN_RUN, tmp_path)
-    record = json.loads((outcome.folder / "sparsity.json").read_text())
+def test_sparsity_json_says_what_was_trained_and_how_sparse_it_is(finished):
+    record = json.loads((finished.folder / "sparsity.json").read_text())
     assert RunSpec(**record["run"]) == DQN_RUN
     assert (record["status"], record["method"], record["num_timesteps"]) == (
         "finished",
         "rigl",
-        1000,
+        500,
     )
     assert record["settings"]["policy_kwargs"]["net_arch"] == [16, 16]
-    assert record["evaluation"] == {"eval_freq": 200, "eval_episodes": 2}
+    assert record["evaluation"] == {"eval_freq": 100, "eval_episodes": 2}
     assert [result["path"] for result in record["results"]] == ["CartPole-v1.zip", "best_model.zip"]
     assert record["versions"]["torch"] == th.__version__
-    masks = [layer.mask() for layer in outcome.model.policy.sparse.layers]
+    masks = [layer.mask() for layer in finished.model.policy.sparse.layers]
     shapes = [[16, 4], [16, 16], [2, 16]]
     assert [layer["shape"] for layer in record["layers"]] == shapes
     assert [layer["nnz"] for layer in record["layers"]] == [int(mask.sum()) for mask in masks]
@@ -112,8 +139,9 @@ def test_sparsity_json_says_what_was_trained_and_how_sparse_it_is(tmp_path):
 
 
 def test_the_best_policy_of_pruning_is_pruned(tmp_path):
+    hyperparams = {**SMALL, "update_interval": 20}
     run = RunSpec(
-        method="prune", n_timesteps=1500, hyperparams={**SMALL, "update_interval": 20}, **QUICK
+        method="prune", n_timesteps=1500, eval_freq=200, eval_episodes=2, hyperparams=hyperparams
     )
     outcome = train(run, tmp_path)
     assert len(evaluations(outcome.folder)[0]) == 7
@@ -127,23 +155,23 @@ def test_the_best_policy_of_pruning_is_pruned(tmp_path):
 @pytest.mark.parametrize(("run", "cls"), [(DQN_RUN, DQN), (PPO_RUN, PPO)])
 def test_a_stopped_run_goes_on_and_evaluates_every_point_once(run, cls, number, tmp_path):
     handler = signal.getsignal(number)
-    stopped = train(run, tmp_path, [Stop(500, number)])
+    stopped = train(run, tmp_path, [Stop(250, number)])
     assert signal.getsignal(number) == handler
     assert not stopped.finished
     folder = stopped.folder
     record = RunFolder(folder).record()
     assert record["status"] == "interrupted"
-    assert 500 <= record["num_timesteps"] < 700
+    assert 250 <= record["num_timesteps"] < 350
     cls.load(folder / f"{run.env_id}.zip")
     before = evaluations(folder)
-    assert before[0] == [t for t in range(200, 601, 200) if t <= record["num_timesteps"]]
+    assert before[0] == [t for t in range(100, 301, 100) if t <= record["num_timesteps"]]
     checkpoint = RunFolder(folder).last_checkpoint()
     saved = cls.load(checkpoint / f"{run.env_id}.zip")
     if cls is DQN:
         restore_buffer(saved.replay_buffer, checkpoint / "replay_buffer")
         assert saved.replay_buffer.size() == saved.num_timesteps
     else:
-        assert saved.num_timesteps % 128 == 0  # whole rollouts, all learnt from
+        assert saved.num_timesteps % 64 == 0  # whole rollouts, all learnt from
 
     assert saved.num_timesteps == record["num_timesteps"] == stopped.model.num_timesteps
     monitored = load_results(folder)
@@ -156,7 +184,7 @@ def test_a_stopped_run_goes_on_and_evaluates_every_point_once(run, cls, number, 
     for name, weight in saved.policy.state_dict().items():
         assert th.equal(first.state[name], weight), name
     after = evaluations(folder)
-    assert after[0] == list(range(200, run.n_timesteps + 1, 200))
+    assert after[0] == list(range(100, run.n_timesteps + 1, 100))
     assert (after[1][: len(before[0])] == before[1]).all()
     assert sorted(path.name for path in folder.glob("*.csv")) == [
         "0.1.monitor.csv",
@@ -170,7 +198,7 @@ def test_a_stopped_run_goes_on_and_evaluates_every_point_once(run, cls, number, 
     assert done.model.num_timesteps >= run.n_timesteps
     assert done.model._total_timesteps == run.n_timesteps
     if cls is PPO:
-        assert done.model.get_vec_normalize_env().obs_rms.count > 1000
+        assert done.model.get_vec_normalize_env().obs_rms.count > 500
     with pytest.raises(ConfigError, match="is finished"):
         resume(folder)
 
@@ -191,37 +219,38 @@ class Look(BaseCallback):
         return True
 
 
-def test_a_second_interrupt_stops_at_once_and_falls_back_to_the_last_evaluation(tmp_path):
+def test_a_second_interrupt_stops_at_once_and_falls_back_to_the_last_checkpoint(tmp_path):
     with pytest.raises(KeyboardInterrupt):
-        train(DQN_RUN, tmp_path, [Stop(500, times=2)])
+        train(DQN_RUN, tmp_path, [Stop(250, times=2)])
     folder = tmp_path / "dqn" / "CartPole-v1_1"
     assert RunFolder(folder).record()["status"] == "running"
-    assert RunFolder(folder).last_checkpoint().name == "400"
+    (folder / "resume" / "unfinished").mkdir()  # half written, and none
+    assert RunFolder(folder).last_checkpoint().name == "200"
     best = (RunFolder(folder).last_checkpoint() / "best_model.zip").read_bytes()
     (folder / "best_model.zip").write_bytes(b"half a file of a later evaluation")
     look = Look()
     outcome = resume(folder, [look])
     assert outcome.finished
     assert look.best == best
-    assert evaluations(folder)[0] == [200, 400, 600, 800, 1000]
+    assert evaluations(folder)[0] == [100, 200, 300, 400, 500]
     with (folder / "0.1.monitor.csv").open() as file:
         lengths = [int(line.split(",")[1]) for line in list(file)[2:]]
-    assert 300 < sum(lengths) <= 400  # what came after the checkpoint is forgotten
+    assert 150 < sum(lengths) <= 200  # what came after the checkpoint is forgotten
 
 
 def test_a_stop_in_the_last_rollout_leaves_the_last_evaluation_for_later(tmp_path):
-    stopped = train(DQN_RUN, tmp_path, [Stop(1000)])
+    stopped = train(DQN_RUN, tmp_path, [Stop(500)])
     assert not stopped.finished
     assert RunFolder(stopped.folder).record()["status"] == "evaluating"
-    assert stopped.model.num_timesteps == 1000
+    assert stopped.model.num_timesteps == 500
     monitored = load_results(stopped.folder)
     assert resume(stopped.folder).finished
-    assert evaluations(stopped.folder)[0] == [200, 400, 600, 800, 1000]
+    assert evaluations(stopped.folder)[0] == [100, 200, 300, 400, 500]
     assert len(load_results(stopped.folder)) == len(monitored)
 
 
 def test_two_processes_cannot_train_one_run(tmp_path):
-    stopped = train(DQN_RUN, tmp_path, [Stop(300)])
+    stopped = train(DQN_RUN, tmp_path, [Stop(150)])
 
     class Intrude(BaseCallback):
         def _on_training_start(self) -> None:
@@ -266,49 +295,50 @@ class Poison(BaseCallback):
 def test_a_run_that_diverges_says_at_which_step_and_keeps_its_last_policy_of_numbers(
     value, tmp_path
 ):
-    with pytest.raises(Diverged, match="at step 600 there is NaN or infinity in .*learning_rate"):
-        train(DQN_RUN, tmp_path, [Poison(450, value)])
+    with pytest.raises(Diverged, match="at step 300 there is NaN or infinity in .*learning_rate"):
+        train(DQN_RUN, tmp_path, [Poison(225, value)])
     folder = tmp_path / "dqn" / "CartPole-v1_1"
     record = RunFolder(folder).record()
-    assert (record["status"], record["num_timesteps"]) == ("diverged", 600)
-    assert record["last_policy"] == 400
-    assert "at step 600" in record["error"]
-    assert "the last policy is that of step 400" in record["error"]
+    assert (record["status"], record["num_timesteps"]) == ("diverged", 300)
+    assert record["last_policy"] == 200
+    assert "at step 300" in record["error"]
+    assert "the last policy is that of step 200" in record["error"]
     assert "results" not in record
-    assert evaluations(folder)[0] == [200, 400]
+    assert evaluations(folder)[0] == [100, 200]
     for name in ("CartPole-v1.zip", "best_model.zip"):
         model = DQN.load(folder / name)
-        assert model.num_timesteps <= 400
+        assert model.num_timesteps <= 200
         assert all(bool(th.isfinite(p).all()) for p in model.policy.parameters())
     assert not (folder / "resume").exists()
     assert enjoy(folder, episodes=1).episodes == 1
-    with pytest.raises(ConfigError, match=r"has ended: training diverged: at step 600"):
+    with pytest.raises(ConfigError, match=r"has ended: training diverged: at step 300"):
         resume(folder)
 
 
 def test_a_checkpoint_is_never_of_networks_that_diverged(tmp_path):
-    class After(Poison):  # the evaluation at step 400, before the checkpoint
+    class After(Poison):  # the evaluation at step 200, before the checkpoint
         def _on_rollout_end(self) -> None:
-            if self.num_timesteps == 400:
-                self.at = 400
+            if self.num_timesteps == 200:
+                self.at = 200
                 self._on_step()
 
-    with pytest.raises(Diverged, match="at step 400"):
+    with pytest.raises(Diverged, match="at step 200"):
         train(DQN_RUN, tmp_path, [After(-1)])
     folder = tmp_path / "dqn" / "CartPole-v1_1"
-    assert RunFolder(folder).record()["last_policy"] == 200
-    assert evaluations(folder)[0] == [200, 400]
+    assert RunFolder(folder).record()["last_policy"] == 100
+    assert evaluations(folder)[0] == [100, 200]
 
 
 def test_networks_that_diverge_after_the_last_evaluation_are_no_finished_run(tmp_path):
-    run = replace(DQN_RUN, n_timesteps=1050)
-    with pytest.raises(Diverged, match="at step 1050"):
-        train(run, tmp_path, [Poison(1020)])
-    assert RunFolder(tmp_path / "dqn" / "CartPole-v1_1").record()["last_policy"] == 1000
+    run = replace(DQN_RUN, n_timesteps=525)
+    with pytest.raises(Diverged, match="at step 525"):
+        train(run, tmp_path, [Poison(510)])
+    assert RunFolder(tmp_path / "dqn" / "CartPole-v1_1").record()["last_policy"] == 500
 
 
 def test_what_sb3_raises_of_networks_that_diverged_is_said_to_be_that(tmp_path):
-    run = replace(PPO_RUN, hyperparams={**PPO_RUN.hyperparams, "learning_rate": 1e30})
+    large = {"learning_rate": 1e30, "n_steps": 128}
+    run = replace(PPO_RUN, hyperparams={**PPO_RUN.hyperparams, **large})
     with pytest.raises(Diverged, match="training diverged: at step") as caught:
         train(run, tmp_path)
     assert "no policy was saved before" in str(caught.value)
@@ -321,14 +351,14 @@ def test_an_evaluation_without_a_finite_return_ends_the_run(tmp_path, monkeypatc
         "stable_baselines3.common.callbacks.evaluate_policy",
         lambda *args, **kwargs: ([float("nan")], [1]),
     )
-    with pytest.raises(Diverged, match="the evaluation at step 200 has the return nan"):
+    with pytest.raises(Diverged, match="the evaluation at step 100 has the return nan"):
         train(DQN_RUN, tmp_path)
     assert RunFolder(tmp_path / "dqn" / "CartPole-v1_1").record()["status"] == "diverged"
 
 
 def test_a_run_that_failed_says_so_and_can_go_on(tmp_path):
     with pytest.raises(OSError, match="no space left"):
-        train(DQN_RUN, tmp_path, [Break(500)])
+        train(DQN_RUN, tmp_path, [Break(250)])
     folder = tmp_path / "dqn" / "CartPole-v1_1"
     record = RunFolder(folder).record()
     assert (record["status"], record["error"]) == ("failed", "OSError: no space left")
@@ -343,16 +373,16 @@ def full(*args, **kwargs):
 def test_a_full_disk_says_what_is_kept_and_how_to_go_on(tmp_path, monkeypatch):
     log_folder = tmp_path / "my logs"
     save = BufferSaver.save
-    monkeypatch.setattr(BufferSaver, "save", lambda *a: (full if a[2] > 400 else save)(*a))
+    monkeypatch.setattr(BufferSaver, "save", lambda *a: (full if a[2] > 200 else save)(*a))
     with pytest.raises(Unwritable, match="No space left on device. The run stopped at") as caught:
         train(DQN_RUN, log_folder)
     monkeypatch.undo()
     folder = log_folder / "dqn" / "CartPole-v1_1"
     assert f"{folder} cannot be written" in str(caught.value)
-    assert f"from step 400: sb3-sparse train --resume '{folder}'" in str(caught.value)
+    assert f"from step 200: sb3-sparse train --resume '{folder}'" in str(caught.value)
     record = RunFolder(folder).record()
     assert (record["status"], "No space left" in record["error"]) == ("failed", True)
-    assert [path.name for path in (folder / "resume").iterdir()] == ["400"]
+    assert [path.name for path in (folder / "resume").iterdir()] == ["200"]
     assert resume(folder).finished
 
 
@@ -371,18 +401,18 @@ def test_a_full_disk_under_everything_leaves_the_status_of_a_run_that_was_killed
 ):
     class Fill(BaseCallback):
         def _on_step(self) -> bool:
-            if self.num_timesteps == 450:
+            if self.num_timesteps == 225:
                 monkeypatch.setattr(Path, "replace", full)
                 monkeypatch.setattr(BufferSaver, "save", full)
             return True
 
-    with pytest.raises(Unwritable, match="resume it from step 400"):
+    with pytest.raises(Unwritable, match="resume it from step 200"):
         train(DQN_RUN, tmp_path, [Fill()])
     monkeypatch.undo()
     folder = tmp_path / "dqn" / "CartPole-v1_1"
     assert RunFolder(folder).record()["status"] == "running"
     DQN.load(folder / "best_model.zip")
-    assert evaluations(folder)[0] == [200, 400]  # as before the disk was full
+    assert evaluations(folder)[0] == [100, 200]  # as before the disk was full
     assert resume(folder).finished
 
 
@@ -392,28 +422,9 @@ def test_a_folder_that_cannot_be_written_to_is_named_with_the_option(tmp_path):
         train(DQN_RUN, tmp_path / "logs")
 
 
-class Seen(Watch):
-    """Notes what a run tells."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.folders, self.evaluations, self.episodes = [], [], []
-
-    def begins(self, folder, match) -> None:
-        self.folders.append((folder, match))
-
-    def evaluated(self, step, mean, std, best) -> None:
-        self.evaluations.append((step, mean, std, best))
-
-    def plays(self, what, done, planned) -> None:
-        self.episodes.append((what, done, planned))
-
-
-def test_a_run_tells_of_each_evaluation_and_each_episode_at_its_end(tmp_path):
-    seen = Seen()
-    outcome = train(DQN_RUN, tmp_path, watch=seen)
-    assert seen.folders == [(outcome.folder, None)]
-    steps, results = evaluations(outcome.folder)
+def test_a_run_tells_of_each_evaluation_and_each_episode_at_its_end(finished, seen):
+    assert seen.folders == [(finished.folder, None)]
+    steps, results = evaluations(finished.folder)
     assert [one[0] for one in seen.evaluations] == steps
     assert [one[1] for one in seen.evaluations] == results.mean(axis=1).tolist()
     assert [one[2] for one in seen.evaluations] == results.std(axis=1).tolist()
@@ -425,7 +436,7 @@ def test_a_run_tells_of_each_evaluation_and_each_episode_at_its_end(tmp_path):
     ):  # as many as --eval-episodes says
         told = [one[1:] for one in seen.episodes if one[0] == what]
         assert told == [(0, 2), (1, 2), (2, 2)]
-    assert [result.episodes for result in outcome.results] == [2, 2]
+    assert [result.episodes for result in finished.results] == [2, 2]
 
 
 def test_while_a_run_is_pruned_there_is_no_best(tmp_path):
@@ -435,26 +446,36 @@ def test_while_a_run_is_pruned_there_is_no_best(tmp_path):
     assert [best is None for *_, best in seen.evaluations] == [True, True, True, True, False]
 
 
-def test_a_checkpoint_that_cannot_be_read_is_named(tmp_path):
-    stopped = train(DQN_RUN, tmp_path, [Stop(500)])
-    (RunFolder(stopped.folder).last_checkpoint() / "CartPole-v1.zip").write_bytes(b"")
-    with pytest.raises(CorruptStateError, match=r"resume/500/CartPole-v1.zip is damaged"):
-        resume(stopped.folder)
+@pytest.fixture(scope="module")
+def stopped_once(tmp_path_factory):
+    """Folder of a run that was stopped after 250 steps."""
+    return train(DQN_RUN, tmp_path_factory.mktemp("logs"), [Stop(250)]).folder
 
 
-def test_a_run_whose_buffer_is_not_whole_goes_on_with_none_only_when_told(tmp_path):
-    stopped = train(DQN_RUN, tmp_path, [Stop(500)])
-    buffer = RunFolder(stopped.folder).last_checkpoint() / "replay_buffer"
+@pytest.fixture
+def stopped(stopped_once, tmp_path):
+    """A copy of it."""
+    return shutil.copytree(stopped_once, tmp_path / "dqn" / stopped_once.name)
+
+
+def test_a_checkpoint_that_cannot_be_read_is_named(stopped):
+    (RunFolder(stopped).last_checkpoint() / "CartPole-v1.zip").write_bytes(b"")
+    with pytest.raises(CorruptStateError, match=r"resume/250/CartPole-v1.zip is damaged"):
+        resume(stopped)
+
+
+def test_a_run_whose_buffer_is_not_whole_goes_on_with_none_only_when_told(stopped):
+    buffer = RunFolder(stopped).last_checkpoint() / "replay_buffer"
     (buffer / "0.npz").unlink()
     with pytest.raises(ConfigError, match="0.npz is missing. Restore it from a copy, or delete"):
-        resume(stopped.folder)
-    assert RunFolder(stopped.folder).record()["status"] == "interrupted"
+        resume(stopped)
+    assert RunFolder(stopped).record()["status"] == "interrupted"
     shutil.rmtree(buffer)
     with pytest.warns(UserWarning, match="continues with an empty one"):
-        done = resume(stopped.folder)
+        done = resume(stopped)
     assert done.finished
-    assert done.model.replay_buffer.size() == 500  # of 1000
-    assert RunFolder(stopped.folder).record()["without_buffer_from"] == 500
+    assert done.model.replay_buffer.size() == 250  # of 500
+    assert RunFolder(stopped).record()["without_buffer_from"] == 250
 
 
 def test_an_environment_that_breaks_loses_nothing_of_a_trained_run(tmp_path, monkeypatch):
@@ -495,11 +516,11 @@ def test_a_device_that_is_not_there_is_refused(tmp_path):
 
 def test_a_run_that_died_before_its_first_evaluation_starts_again(tmp_path):
     with pytest.raises(KeyboardInterrupt):
-        train(DQN_RUN, tmp_path, [Stop(100, times=2)])
+        train(DQN_RUN, tmp_path, [Stop(60, times=2)])
     folder = tmp_path / "dqn" / "CartPole-v1_1"
     assert RunFolder(folder).last_checkpoint() is None
     assert resume(folder).finished
-    assert evaluations(folder)[0] == [200, 400, 600, 800, 1000]
+    assert evaluations(folder)[0] == [100, 200, 300, 400, 500]
 
 
 def test_a_run_that_died_in_its_last_evaluation_only_does_that_again(tmp_path, monkeypatch):
@@ -514,42 +535,33 @@ def test_a_run_that_died_in_its_last_evaluation_only_does_that_again(tmp_path, m
     steps = Look()
     assert resume(folder, [steps]).finished
     assert not hasattr(steps, "steps")  # never trained
-    assert evaluations(folder)[0] == [200, 400, 600, 800, 1000]
-
-
-def test_a_checkpoint_half_written_is_not_one(tmp_path):
-    with pytest.raises(KeyboardInterrupt):
-        train(DQN_RUN, tmp_path, [Stop(500, times=2)])
-    folder = tmp_path / "dqn" / "CartPole-v1_1"
-    (folder / "resume" / "unfinished").mkdir()
-    assert RunFolder(folder).last_checkpoint().name == "400"
-    assert resume(folder).finished
+    assert evaluations(folder)[0] == [100, 200, 300, 400, 500]
 
 
 def test_a_resume_needs_nothing_but_the_run(tmp_path, monkeypatch):
     path = tmp_path / "mine.yml"
     path.write_text(DQN_RUN.config.read_text())
     run = replace(DQN_RUN, conf_file=str(path))
-    stopped = train(run, tmp_path, [Stop(300)])
+    stopped = train(run, tmp_path, [Stop(150)])
     path.unlink()
     monkeypatch.setattr("sb3_sparse.zoo.spec.evaluation_of", None)
     assert resume(stopped.folder).finished
-    assert evaluations(stopped.folder)[0] == [200, 400, 600, 800, 1000]
+    assert evaluations(stopped.folder)[0] == [100, 200, 300, 400, 500]
 
 
 def test_masks_move_after_a_resume_as_the_schedule_says(tmp_path):
     run = replace(DQN_RUN, hyperparams={**DQN_RUN.hyperparams, "net_arch": [64, 64]})
-    stopped = train(run, tmp_path, [Stop(500)])
+    stopped = train(run, tmp_path, [Stop(250)])
     done = resume(stopped.folder)
     # every 20 gradient steps, which begin after 50 steps of collecting; the last one or two have
     # a drop fraction too small for a single connection
     counts = [one.policy.sparse.networks[0].mask_updates for one in (stopped.model, done.model)]
-    assert counts[0] == (500 - 50) // 20
-    assert (0.8 * 1000 - 50) // 20 - 2 <= counts[1] <= (0.8 * 1000 - 50) // 20
+    assert counts[0] == (250 - 50) // 20
+    assert (0.8 * 500 - 50) // 20 - 2 <= counts[1] <= (0.8 * 500 - 50) // 20
 
 
 def test_a_dense_run_of_equal_parameters_says_what_it_reached(tmp_path):
-    run, seen = RunSpec(method="dense", match_params=0.9, n_timesteps=200, **QUICK), Seen()
+    run, seen = RunSpec(method="dense", match_params=0.9, n_timesteps=100, **QUICK), Seen()
     outcome = train(run, tmp_path, watch=seen)
     record = RunFolder(outcome.folder).record()
     match = record["match"]
@@ -565,7 +577,7 @@ def test_a_dense_run_of_equal_parameters_says_what_it_reached(tmp_path):
 
 def test_tensorboard_goes_on_in_the_same_folder(tmp_path):
     log = str(tmp_path / "tb")
-    stopped = train(DQN_RUN, tmp_path / "logs", [Stop(500)], tensorboard_log=log)
+    stopped = train(DQN_RUN, tmp_path / "logs", [Stop(250)], tensorboard_log=log)
     resume(stopped.folder)
     folders = {path.parent for path in (tmp_path / "tb").rglob("*tfevents*")}
     assert [folder.name for folder in folders] == ["dqn_CartPole-v1_1_1"]
@@ -573,7 +585,7 @@ def test_tensorboard_goes_on_in_the_same_folder(tmp_path):
 
 def test_noise_and_other_wrappers_come_from_the_settings(tmp_path):
     wrapper = [{"sb3_sparse.wrappers.ObservationNoise": {"sigma": 0.1, "std": [1, 1, 1, 1]}}]
-    run = RunSpec(n_timesteps=200, hyperparams={"env_wrapper": wrapper, **SMALL}, **QUICK)
+    run = RunSpec(n_timesteps=100, hyperparams={"env_wrapper": wrapper, **SMALL}, **QUICK)
     outcome = train(run, tmp_path)
     assert outcome.finished
     assert enjoy(outcome.folder, episodes=2).episodes == 2
@@ -632,10 +644,10 @@ def test_every_method_and_algorithm_runs_by_its_config(method, algo, tmp_path):
         algo=algo,
         env_id="CartPole-v1" if discrete else "Pendulum-v1",
         method=method,
-        n_timesteps=64,
-        eval_freq=64,
+        n_timesteps=16,
+        eval_freq=16,
         eval_episodes=1,
-        hyperparams={"net_arch": [8, 8]}
+        hyperparams={"net_arch": [8, 8], "env_kwargs": {"max_episode_steps": 20}}
         | ({"n_steps": 8} if algo in ("ppo", "a2c", "trpo") else {"learning_starts": 8}),
     )
     outcome = train(run, tmp_path)
@@ -654,7 +666,12 @@ def test_an_atari_run_stacks_frames_resumes_and_is_filmed(tmp_path, monkeypatch)
         n_timesteps=60,
         eval_freq=30,
         eval_episodes=1,
-        hyperparams={"features_extractor_kwargs": small, "learning_starts": 8, "buffer_size": 100},
+        hyperparams={
+            "features_extractor_kwargs": small,
+            "learning_starts": 8,
+            "buffer_size": 100,
+            "env_kwargs": {"max_num_frames_per_episode": 400},
+        },
     )
     stopped = train(run, tmp_path, [Stop(40)])
     assert stopped.folder == tmp_path / "dqn" / "PongNoFrameskip-v4_1"
