@@ -23,7 +23,7 @@ def compile_watched(library: Path) -> None:
     spec = importlib.util.spec_from_file_location("hatch_build", ROOT / "hatch_build.py")
     hook = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(hook)
-    hook.compile_kernels(SOURCES, library, ("-fsanitize=address", "-g", "-O1"))
+    hook.compile_kernels(SOURCES, library, ("-fsanitize=address", "-g", "-O0"))
 
 
 def run_watched(program: Path, library: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
