@@ -100,6 +100,17 @@ def test_panels_of_a_row_share_their_axes_and_labels_stand_outside(drawn, name):
 
 
 @pytest.mark.parametrize("name", list(FIGURES))
+def test_ticks_of_an_axis_are_alike_since_matplotlib_measures_one_of_them_by_chance(drawn, name):
+    for one in drawn[name].figure.axes:
+        for axis in (one.xaxis, one.yaxis):
+            seen = {
+                (tick.tick1line.get_visible(), tick.tick2line.get_visible())
+                for tick in axis.get_major_ticks()
+            }
+            assert len(seen) <= 1
+
+
+@pytest.mark.parametrize("name", list(FIGURES))
 def test_texts_are_large_enough_and_do_not_overlap(drawn, name):
     figure = drawn[name].figure
     with styled():

@@ -57,7 +57,8 @@ def _axes(one: Axes, lines: list[Pair]) -> None:
         if not better:
             tick.label1.set_fontweight("bold")
             tick.gridline.set_visible(False)
-            tick.tick1line.set_visible(False)
+            # Invisible would not do: matplotlib measures one of an axis's ticks, by chance.
+            tick.tick1line.set_markersize(0)
     one.set_ylim(len(lines) - 0.4, -0.6)
 
 
