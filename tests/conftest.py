@@ -3,10 +3,9 @@ from __future__ import annotations
 import gc
 import os
 import signal
-import sys
 
 import pytest
-import support  # noqa: F401  (registers environments and a third-party method)
+import support  # which also registers environments and a third-party method
 import torch as th
 
 from sb3_sparse.engine.native import library
@@ -51,16 +50,11 @@ def distributions_check_their_arguments(monkeypatch):
 
 @pytest.fixture
 def sb3_sparse(tmp_path, monkeypatch, capsys):
-    """Runs a command in the test's folder, and gives its exit code and what it printed."""
+    """Runs a command in the test's folder, and gives its exit code, its output, and its errors."""
 
     def call(*args: str) -> tuple[int, str, str]:
-        from sb3_sparse.cli import main
-
         monkeypatch.chdir(tmp_path)
-        monkeypatch.setattr(sys, "argv", ["sb3-sparse", *args])
-        with pytest.raises(SystemExit) as ended:
-            main()
-        return ended.value.code, *capsys.readouterr()
+        return support.run_command(monkeypatch, capsys, *args)
 
     return call
 

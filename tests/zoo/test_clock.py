@@ -52,32 +52,32 @@ def recorded(folder):
 
 def test_steps_count_and_evaluations_do_not(time, tmp_path):
     outcome = train(DQN_RUN, tmp_path, [Tick(time)], watch=SlowEvaluations(time))
-    assert recorded(outcome.folder) == Seconds(1000, 2000)
+    assert recorded(outcome.folder) == Seconds(500, 1000)
 
 
 def test_a_stopped_run_adds_up(time, tmp_path):
     def callbacks():
-        return [Tick(time), Stop(500)]
+        return [Tick(time), Stop(250)]
 
     folder = train(DQN_RUN, tmp_path, callbacks(), watch=SlowEvaluations(time)).folder
     stopped = RunFolder(folder).record().num_timesteps
     assert recorded(folder) == Seconds(stopped, 2 * stopped)
     time.append(Seconds(5000, 5000))  # the time between two processes
     resume(folder, [Tick(time)], SlowEvaluations(time))
-    assert recorded(folder) == Seconds(1000, 2000)
+    assert recorded(folder) == Seconds(500, 1000)
 
 
 def test_what_a_kill_cost_counts_once(time, tmp_path):
     with pytest.raises(KeyboardInterrupt):
-        train(DQN_RUN, tmp_path, [Tick(time), Stop(500, times=2)])
+        train(DQN_RUN, tmp_path, [Tick(time), Stop(250, times=2)])
     folder = tmp_path / "dqn" / "CartPole-v1_1"
-    assert recorded(folder) == Seconds(400, 800)  # of the last checkpoint
+    assert recorded(folder) == Seconds(200, 400)  # of the last checkpoint
     resume(folder, [Tick(time)])
-    assert recorded(folder) == Seconds(1000, 2000)
+    assert recorded(folder) == Seconds(500, 1000)
 
 
 def test_a_run_that_an_older_version_began_has_no_total(time, tmp_path):
-    folder = train(DQN_RUN, tmp_path, [Tick(time), Stop(500)]).folder
+    folder = train(DQN_RUN, tmp_path, [Tick(time), Stop(250)]).folder
     path = folder / "sparsity.json"
     record = json.loads(path.read_text())
     del record["seconds"]

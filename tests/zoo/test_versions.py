@@ -214,7 +214,7 @@ def test_a_continued_run_has_the_commits_of_all_its_processes(monkeypatch, befor
 
 def test_a_resumed_run_names_both_commits(tmp_path, monkeypatch):
     monkeypatch.setattr(versions, "COMMIT", FIRST)
-    stopped = train(DQN_RUN, tmp_path, [Stop(500)])
+    stopped = train(DQN_RUN, tmp_path, [Stop(250)])
     monkeypatch.setattr(versions, "COMMIT", SECOND)
     resume(stopped.folder)
     record = RunFolder(stopped.folder).record()
@@ -226,7 +226,7 @@ def test_a_resumed_run_names_both_commits(tmp_path, monkeypatch):
 
 def test_a_run_that_begins_anew_names_the_second_alone(tmp_path, monkeypatch):
     monkeypatch.setattr(versions, "COMMIT", FIRST)
-    stopped = train(DQN_RUN, tmp_path, [Stop(500)])
+    stopped = train(DQN_RUN, tmp_path, [Stop(250)])
     RunFolder(stopped.folder).clear_checkpoints()
     monkeypatch.setattr(versions, "COMMIT", SECOND)
     resume(stopped.folder)
