@@ -168,13 +168,13 @@ class Drawn:
         for finding in FINDINGS:
             link = f"[{finding.text.removesuffix('.')}](#{finding.key})"
             for one, shown in self._judged(finding.key):
-                by = f"{one.family}, {shown.steps:,} steps"
                 verdict = one.verdict
                 if verdict != UNDECIDED:
                     decided.add(finding.key)
                     verdict = f"**{verdict}**"
                 effect = one.shown.replace(" ", "\N{NO-BREAK SPACE}")
-                cells = (link, by, verdict, effect, one.holds, str(one.seeds))
+                seeds = f"{one.seeds} of {len({cell.run.seed for cell in shown.study.cells})}"
+                cells = (link, _where(one, shown), verdict, effect, one.holds, seeds)
                 rows.append(f"| {' | '.join(cells)} |")
                 link = ""  # said once
             if not self._judged(finding.key):
@@ -208,12 +208,15 @@ class Drawn:
         drawn = self._judged(key)
         for one, shown in drawn:
             published = " (as published)" if PUBLISHED.get(one.family) == shown.steps else ""
-            yield f"- {one.family}, {shown.steps:,} steps{published}: {_said(one)}"
+            yield f"- {_where(one, shown)}{published}: {_said(one)}"
         if drawn:
-            self.figures[f"finding-{key}"] = lambda: _forest(_fullest(drawn), key)
+            fullest = _fullest(drawn)
+            self.figures[f"finding-{key}"] = lambda: _forest(fullest, key)
             (text,) = (one.text for one in FINDINGS if one.key == key)
             yield ""
             yield f"![{text} Effects with 95 % intervals.](figures/finding-{key}.svg)"
+            yield ""
+            yield f"Shown: {', '.join(_where(one, shown) for one, shown in fullest)}."
         else:
             yield "No study has three seeds of both sides yet."
 
@@ -344,14 +347,16 @@ def _text(entry: object) -> str:
     return "" if entry is None else f"{entry:,}" if isinstance(entry, int) else str(entry)
 
 
+def _where(one: Verdict, shown: Shown) -> str:
+    return f"{one.family} at {shown.steps:,} steps"
+
+
 def _fullest(drawn: Sequence[tuple[Verdict, Shown]]) -> list[tuple[Verdict, Shown]]:
-    """Return the verdict from the most comparisons and seeds of each algorithm and its tasks."""
+    """Return a verdict of each algorithm and its tasks: of most seeds, then of most steps."""
     found: dict[str, tuple[Verdict, Shown]] = {}
-    for one, shown in drawn:
-        before = found.get(one.family)
-        if before is None or one.comparisons * one.seeds > before[0].comparisons * before[0].seeds:
-            found[one.family] = one, shown
-    return list(found.values())
+    for one, shown in sorted(drawn, key=lambda pair: (pair[0].seeds, pair[1].steps)):
+        found[one.family] = one, shown
+    return [found[family] for family in dict.fromkeys(one.family for one, _ in drawn)]
 
 
 def _forest(drawn: Sequence[tuple[Verdict, Shown]], key: str) -> Drawing:
