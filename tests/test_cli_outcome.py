@@ -141,7 +141,7 @@ def test_without_a_terminal_lines_say_the_time_left(tmp_path):
     assert len(lines) == 10
     for line in lines[:3]:  # at most 90 steps, and the 100 before learning_starts say nothing
         assert re.search(r"sparsity \d\d\.\d\d%, \d+ steps/s$", line)
-    for line in lines[4:-1]:
+    for line in lines[3:-1]:
         assert re.search(r"sparsity \d\d\.\d\d%, \d+ steps/s, \d:\d\d:\d\d left$", line)
     assert re.search(
         r"300 of 300 steps, training return \S+, sparsity \S+%, \d+ steps/s$", lines[-1]

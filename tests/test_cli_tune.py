@@ -3,22 +3,13 @@
 from __future__ import annotations
 
 import re
-from functools import partial
 
 import pytest
 import yaml
-from support import run_command
 
 QUICK = ["-n", "200", "--eval-freq", "100", "--eval-episodes", "1", "--method", "rigl"]
 SMALL = ["-params", "net_arch:[16]", "learning_starts:50"]
 STUDY = "dqn_CartPole-v1_rigl_0.9_mine"
-
-
-@pytest.fixture
-def sb3_sparse(tmp_path, monkeypatch, capsys):
-    """Runs a command in the test's folder, and gives its exit code, output and errors."""
-    monkeypatch.chdir(tmp_path)
-    return partial(run_command, monkeypatch, capsys)
 
 
 def test_tune_searches_writes_the_best_goes_on_and_reports(tmp_path, sb3_sparse):

@@ -68,6 +68,7 @@ class Cell:
     def with_seed(self, seed: int) -> Cell:
         """Return the same cell with another seed, on which its settings do not depend."""
         other = replace(self, run=replace(self.run, seed=seed))
+        # Fills the other's cached properties, so that it looks nothing up.
         vars(other).update(settings=self.settings, _content=self._content)
         return other
 

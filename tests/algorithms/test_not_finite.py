@@ -124,10 +124,11 @@ def test_without_checks_training_goes_on(name, monkeypatch):
 
 @pytest.mark.parametrize("name", ["SAC", "TD3", "DQN"])
 def test_rewards_that_are_not_finite(name):
-    for number in (NAN, INF, 1e35):
+    for number in (NAN, INF, 1e30):
         models = []
         for library in (sb3_sparse, stable_baselines3):
-            model = learn(make(library, name, policy_kwargs=dict(sparsity=0.0)))
+            model = make(library, name, policy_kwargs=dict(sparsity=0.0))
+            learn(model, steps=50)
             model.replay_buffer.rewards[:] = number
             set_random_seed(5)
             model.train(1, 70)
