@@ -23,6 +23,7 @@ from sb3_sparse.zoo.folder import REPLAY_BUFFER, RunFolder, Start
 from sb3_sparse.zoo.replay import end_episodes, restore_buffer
 from sb3_sparse.zoo.settings import Settings
 from sb3_sparse.zoo.spec import RunSpec, algorithms
+from sb3_sparse.zoo.wrappers import with_env_wrappers
 
 try:
     from rl_zoo3.callbacks import SaveVecNormalizeCallback
@@ -90,7 +91,8 @@ class RunManager(ExperimentManager):
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], OrderedDict[str, Any]]:
         """The settings, instead of the YAML file that they came from."""
-        return self.settings.as_dict(), OrderedDict(sorted(self.settings.as_dict().items()))
+        hyperparams = with_env_wrappers(self.settings.as_dict())
+        return hyperparams, OrderedDict(sorted(self.settings.as_dict().items()))
 
     def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
         """Make environments as rl-zoo does, without overwriting the episodes of a trained run.

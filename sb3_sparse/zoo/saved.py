@@ -43,7 +43,7 @@ from sb3_sparse.zoo.run_files import (
 )
 from sb3_sparse.zoo.saved_by import algo_of
 from sb3_sparse.zoo.spec import algorithms
-from sb3_sparse.zoo.wrappers import check_wrappers
+from sb3_sparse.zoo.wrappers import check_wrappers, with_env_wrappers
 
 try:
     from rl_zoo3.utils import create_test_env
@@ -229,9 +229,7 @@ class SavedModel:
             kwargs |= RunFolder(self.parameters.parent).arguments().get("env_kwargs") or {}
             where = f" with the wrappers and arguments in {self.parameters}"
         kwargs |= env_kwargs or {}
-        if wrappers:
-            own = settings.get("env_wrapper") or []
-            settings["env_wrapper"] = [*(own if isinstance(own, list) else [own]), *wrappers]
+        settings = with_env_wrappers(settings, wrappers)
         failure = f"{env_id} cannot be made{where}"
         with setup_errors(failure, env_id), quiet(), mujoco_warns_once(env_id):
             check_wrappers(settings)

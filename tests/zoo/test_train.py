@@ -591,6 +591,17 @@ def test_noise_and_other_wrappers_come_from_the_settings(tmp_path):
     assert enjoy(outcome.folder, episodes=2).episodes == 2
 
 
+def test_a_wrapper_may_end_episodes(tmp_path):
+    wrapper = [{"gymnasium.wrappers.TimeLimit": {"max_episode_steps": 20}}]
+    run = replace(PPO_RUN, hyperparams={**PPO_RUN.hyperparams, "env_wrapper": wrapper})
+    outcome = train(run, tmp_path)
+    lengths = np.load(outcome.folder / "evaluations.npz")["ep_lengths"]
+    assert lengths.tolist() == 5 * [[20, 20]]
+    assert load_results(str(outcome.folder))["l"].tolist() == 25 * [20]
+    assert len(outcome.model.ep_info_buffer) == 25
+    assert enjoy(outcome.folder, episodes=2).episodes == 2
+
+
 def test_evaluation_has_the_environments_arguments_too(tmp_path):
     run = replace(PPO_RUN, hyperparams={**PPO_RUN.hyperparams, "env_kwargs": {"g": 0.0}})
     made = []
