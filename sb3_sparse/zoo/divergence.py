@@ -1,8 +1,9 @@
-"""Checks that networks and returns stay finite during training."""
+"""Checks that networks, distributions of actions and returns are usable during training."""
 
 from __future__ import annotations
 
 import math
+import traceback
 from collections.abc import Iterator
 
 import torch as th
@@ -33,6 +34,23 @@ def check_networks(model: BaseAlgorithm) -> None:
         raise Diverged(
             f"training diverged: at step {model.num_timesteps} there is NaN or infinity in {names}"
             f"{more}; {CURE}"
+        )
+
+
+def check_actions(model: BaseAlgorithm, error: Exception) -> None:
+    """Raise if an error is torch's refusal to make a distribution of what the policy computes.
+
+    Weights may be finite and yet too large, e.g. a logarithm of -1e30 for a standard deviation.
+
+    :raises Diverged: naming the step and what to do
+    """
+    last = None
+    for frame, _ in traceback.walk_tb(error.__traceback__):
+        last = frame.f_globals.get("__name__", "")
+    if isinstance(error, ValueError) and str(last).startswith("torch.distributions."):
+        raise Diverged(
+            f"training diverged: at step {model.num_timesteps} the policy's actions have no "
+            f"distribution, though all networks are finite; {CURE}"
         )
 
 

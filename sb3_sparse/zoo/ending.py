@@ -10,7 +10,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from sb3_sparse.errors import Diverged, SparsityError, Unwritable, command
 from sb3_sparse.zoo.checkpoint import StopTraining
 from sb3_sparse.zoo.disk import refusal
-from sb3_sparse.zoo.divergence import check_networks
+from sb3_sparse.zoo.divergence import check_actions, check_networks
 from sb3_sparse.zoo.folder import RunFolder
 from sb3_sparse.zoo.record import Status
 
@@ -68,7 +68,7 @@ def _how_to_resume(folder: RunFolder, model: BaseAlgorithm) -> str:
 
 @contextmanager
 def diverging(model: BaseAlgorithm) -> Iterator[None]:
-    """Raise Diverged in place of any error that occurs while the networks hold NaN."""
+    """Raise Diverged in place of an error that comes from networks with NaN or huge weights."""
     try:
         yield
     except (SparsityError, StopTraining):
@@ -76,6 +76,7 @@ def diverging(model: BaseAlgorithm) -> Iterator[None]:
     except Exception as error:
         try:
             check_networks(model)
+            check_actions(model, error)
         except Diverged as diverged:
             raise diverged from error
         raise

@@ -18,6 +18,7 @@ from stable_baselines3.common.monitor import load_results
 from support import ALGORITHMS
 
 from sb3_sparse.errors import ConfigError, CorruptStateError, Diverged, Unwritable
+from sb3_sparse.zoo.ending import diverging
 from sb3_sparse.zoo.folder import RunFolder
 from sb3_sparse.zoo.replay import BufferSaver, restore_buffer
 from sb3_sparse.zoo.scoring import enjoy
@@ -336,14 +337,34 @@ def test_networks_that_diverge_after_the_last_evaluation_are_no_finished_run(tmp
     assert RunFolder(tmp_path / "dqn" / "CartPole-v1_1").record()["last_policy"] == 500
 
 
-def test_what_sb3_raises_of_networks_that_diverged_is_said_to_be_that(tmp_path):
-    large = {"learning_rate": 1e30, "n_steps": 128}
+@pytest.mark.parametrize("n_steps", [64, 128])  # of numbers that are too large, and of NaN
+def test_what_sb3_raises_of_networks_that_diverged_is_said_to_be_that(n_steps, tmp_path):
+    large = {"learning_rate": 1e30, "n_steps": n_steps}
     run = replace(PPO_RUN, hyperparams={**PPO_RUN.hyperparams, **large})
     with pytest.raises(Diverged, match="training diverged: at step") as caught:
         train(run, tmp_path)
     assert "no policy was saved before" in str(caught.value)
     record = RunFolder(tmp_path / "ppo" / "Pendulum-v1_1").record()
     assert (record["status"], record["last_policy"]) == ("diverged", None)
+
+
+def test_an_error_of_the_environment_is_none_of_the_networks(tmp_path):
+    class Refuse(BaseCallback):
+        def _on_step(self) -> bool:
+            raise ValueError("Expected parameter scale")
+
+    with pytest.raises(ValueError, match="Expected parameter scale") as caught:
+        train(PPO_RUN, tmp_path, [Refuse()])
+    assert not isinstance(caught.value, Diverged)
+
+
+def test_actions_without_a_distribution_are_those_of_networks_that_diverged():
+    model = PPO("MlpPolicy", "Pendulum-v1")
+    with th.no_grad():
+        model.policy.log_std.fill_(-1e30)  # finite, but its exponential is 0
+    without = pytest.raises(Diverged, match="at step 0 the policy's actions have no distribution")
+    with without, diverging(model):
+        model.predict(np.zeros(3, np.float32))
 
 
 def test_an_evaluation_without_a_finite_return_ends_the_run(tmp_path, monkeypatch):
