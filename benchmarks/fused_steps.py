@@ -17,7 +17,6 @@ from statistics import median
 from typing import Any, NamedTuple
 
 import gymnasium as gym
-import stable_baselines3
 import torch as th
 from gymnasium import spaces
 from random_env import TORQUES, VECTOR, RandomEnv
@@ -41,6 +40,8 @@ CASES = {
     "SAC 64": Case("SAC", 64, 256),
     "TD3 256": Case("TD3", 256, 256),
     "DQN 512": Case("DQN", 512, 128),
+    "TQC 256": Case("TQC", 256, 256),
+    "QRDQN 256": Case("QRDQN", 256, 128),
     "PPO 64": Case("PPO", 64, 64),
     "SimBa SAC 128": Case("SAC", 128, 256, "SparseSimbaPolicy"),
     "SimBa SAC 256": Case("SAC", 256, 256, "SparseSimbaPolicy"),
@@ -50,13 +51,13 @@ STEPS = 20
 """Gradient steps in one timing."""
 
 
-def make(package: Any, case: Case, sparsity: float | None) -> Any:
+def make(algorithm: Any, case: Case, sparsity: float | None) -> Any:
     """Make a model; give a function that takes gradient steps, and their number too.
 
+    :param algorithm: its class, stock's or this package's
     :param sparsity: None: SB3's own policy, or a dense SimBa network in SB3's own steps
     """
-    algorithm = getattr(package, case.algorithm)
-    actions = spaces.Discrete(4) if case.algorithm == "DQN" else TORQUES
+    actions = spaces.Discrete(4) if case.algorithm in ("DQN", "QRDQN") else TORQUES
     env: gym.Env = RandomEnv(VECTOR, actions)
     widths: Any = [case.width, case.width]
     if case.policy == "SparseSimbaPolicy":
@@ -77,10 +78,11 @@ def time_case(case: Case, sparsity: float, rounds: int) -> dict[str, dict[str, f
 
     :raises SystemExit: if our steps are not fused
     """
+    stock = sb3_sparse.supported_algorithms()[case.algorithm]
     made = {
-        "stock": make(stable_baselines3, case, None),
-        "plug-in": make(stable_baselines3, case, sparsity),
-        "fused": make(sb3_sparse, case, sparsity),
+        "stock": make(stock, case, None),
+        "plug-in": make(stock, case, sparsity),
+        "fused": make(getattr(sb3_sparse, case.algorithm), case, sparsity),
     }
     why = made["fused"][0].why_not_fused()
     if why is not None:

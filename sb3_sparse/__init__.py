@@ -26,8 +26,10 @@ if TYPE_CHECKING:
     from sb3_sparse.algorithms.a2c import A2C
     from sb3_sparse.algorithms.dqn import DQN
     from sb3_sparse.algorithms.ppo import PPO
+    from sb3_sparse.algorithms.qrdqn import QRDQN
     from sb3_sparse.algorithms.sac import SAC
     from sb3_sparse.algorithms.td3 import DDPG, TD3
+    from sb3_sparse.algorithms.tqc import TQC
     from sb3_sparse.callback import SparsityCallback
     from sb3_sparse.callbacks.recycle import RecycleDormantCallback
     from sb3_sparse.callbacks.reset import ResetCallback
@@ -71,7 +73,7 @@ __all__ = [
     "supported_algorithms",
 ]
 if find_spec("sb3_contrib"):
-    __all__ += ["SparseCrossQPolicy", "SparseQRDQNPolicy", "SparseTQCPolicy"]
+    __all__ += ["QRDQN", "TQC", "SparseCrossQPolicy", "SparseQRDQNPolicy", "SparseTQCPolicy"]
 __getattr__, __dir__ = lazily(
     __name__,
     {

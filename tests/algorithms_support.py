@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
-import stable_baselines3
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -15,9 +15,13 @@ from stable_baselines3.common.callbacks import BaseCallback
 import sb3_sparse
 import sb3_sparse.algorithms
 
-NAMES = ("SAC", "TD3", "DDPG", "DQN", "PPO", "A2C")
+NAMES = ("SAC", "TD3", "DDPG", "DQN", "PPO", "A2C", "TQC", "QRDQN")
 assert set(NAMES) == set(sb3_sparse.algorithms.__all__)
-OFF_POLICY = ("SAC", "TD3", "DDPG", "DQN")
+OFF_POLICY = ("SAC", "TD3", "DDPG", "DQN", "TQC", "QRDQN")
+DISCRETE = ("DQN", "QRDQN")
+QUANTILES = ("TQC", "QRDQN")
+STOCK = SimpleNamespace(**sb3_sparse.supported_algorithms())
+"""The classes of SB3 and sb3-contrib."""
 METHODS = ("static", "set", "rigl", "prune", "granet", "dense")
 STORAGES = ("masked", "sparse", "auto")
 BOX = spaces.Box(-1.0, 1.0, (3,))
@@ -49,7 +53,7 @@ class Noise(gym.Env):
 
 
 def actions_of(name: str) -> gym.Space:
-    return spaces.Discrete(4) if name == "DQN" else BOX
+    return spaces.Discrete(4) if name in DISCRETE else BOX
 
 
 def arguments_of(name: str) -> dict[str, Any]:
@@ -59,17 +63,19 @@ def arguments_of(name: str) -> dict[str, Any]:
     if name == "A2C":
         return dict(n_steps=5)
     common = dict(learning_starts=20, buffer_size=200, batch_size=70)
-    return dict(common, train_freq=1, target_update_interval=10) if name == "DQN" else common
+    return dict(common, train_freq=1, target_update_interval=10) if name in DISCRETE else common
 
 
 def make(library: Any, name: str, env: Any = None, **kwargs: Any) -> BaseAlgorithm:
     """A seeded model.
 
-    :param library: ``stable_baselines3`` or ``sb3_sparse``, or a class
+    :param library: ``STOCK`` or ``sb3_sparse``, or a class
     :param kwargs: of the algorithm; ``policy_kwargs`` are added to small ones
     """
     cls = getattr(library, name, library)
     policy_kwargs = {"sparsity": 0.7, "net_arch": [24, 16], **kwargs.pop("policy_kwargs", {})}
+    if name in QUANTILES:
+        policy_kwargs.setdefault("n_quantiles", 6)
     policy = kwargs.pop("policy", "SparsePolicy")
     if policy == "MlpPolicy":
         policy_kwargs.pop("sparsity")
@@ -80,7 +86,7 @@ def make(library: Any, name: str, env: Any = None, **kwargs: Any) -> BaseAlgorit
 
 def learn(model: BaseAlgorithm, callback: Any = None, steps: int | None = None) -> BaseAlgorithm:
     """Twenty or thirty gradient steps, of which the logger keeps what it was told last."""
-    name = next(name for name in NAMES[::-1] if isinstance(model, getattr(stable_baselines3, name)))
+    name = next(name for name in NAMES[::-1] if isinstance(model, getattr(STOCK, name)))
     steps = steps or STEPS.get(name, 40)
     return model.learn(steps, callback, log_interval=10**9, reset_num_timesteps=False)
 
@@ -183,7 +189,7 @@ def assert_like_stock(
     :param env: the same
     """
     models = []
-    for library in (sb3_sparse, stable_baselines3):
+    for library in (sb3_sparse, STOCK):
         arguments = {k: dict(v) if isinstance(v, dict) else v for k, v in kwargs.items()}
         models.append(learn(make(library, name, env(), **arguments), callback(), steps))
     ours, stock = models

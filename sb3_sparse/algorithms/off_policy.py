@@ -1,9 +1,9 @@
-"""Base class of SAC, TD3, DDPG and DQN: batches of a replay buffer."""
+"""Base class of algorithms with a replay buffer: reads its batches."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from functools import partial
 from typing import Any, ClassVar, NamedTuple
 
@@ -54,6 +54,10 @@ class OffPolicy(Fused, OffPolicyAlgorithm):
     def _record(self, program: Program, source: str) -> None:
         """Record one gradient step."""
 
+    def _details(self) -> tuple[Hashable, ...]:
+        """Settings that a recorded gradient step depends on and that may change."""
+        return ()
+
     def _others(self) -> Sequence[th.Tensor]:
         """Parameters that are trained besides the policy's."""
         return ()
@@ -75,7 +79,7 @@ class OffPolicy(Fused, OffPolicyAlgorithm):
         """Return the machine for a batch size, a source and details of the algorithm."""
         optimizers = self._optimizers(*details)
         build = partial(self._record, source=source)
-        return self._trains().machine((source,), batch, optimizers, build)
+        return self._trains().machine((source, *self._details()), batch, optimizers, build)
 
     def _find_source(self) -> str:
         """Choose how to read the replay buffer."""

@@ -2,22 +2,16 @@
 
 from __future__ import annotations
 
-from functools import partial
-from typing import Any
-
-import numpy as np
 import stable_baselines3
-import torch as th
-from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN
 
-from sb3_sparse.algorithms.off_policy import OffPolicy
-from sb3_sparse.fused.distributions import least_of, squashed_gaussian
-from sb3_sparse.fused.machine import Machine
+from sb3_sparse.algorithms.soft import SoftActorCritic
+from sb3_sparse.fused.distributions import least_of
 from sb3_sparse.fused.parts import parts
 from sb3_sparse.fused.program import Program
+from sb3_sparse.fused.values import Value
 
 
-class SAC(OffPolicy, stable_baselines3.SAC):
+class SAC(SoftActorCritic, stable_baselines3.SAC):
     """Stable-Baselines3's SAC with fused gradient steps, if the policy is sparse.
 
     Example::
@@ -29,94 +23,14 @@ class SAC(OffPolicy, stable_baselines3.SAC):
         model.learn(200, callback=SparsityCallback("rigl", update_interval=10))
     """
 
-    methods = {
-        "actor": ("action_log_prob", "get_action_dist_params", "extract_features"),
-        "critic": ("forward", "extract_features"),
-        "critic_target": ("forward", "extract_features"),
-    }
+    def _next_values(self, program: Program, x: Value) -> Value:
+        return least_of([program.network(parts(q), x) for q in self.critic_target.q_networks])
 
-    def _optimizers(self) -> list[th.optim.Optimizer]:
-        optimizers = [self.actor.optimizer, self.critic.optimizer]
-        return optimizers + ([self.ent_coef_optimizer] if self.ent_coef_optimizer else [])
-
-    def _others(self) -> list[th.Tensor]:
-        return [] if self.log_ent_coef is None else [self.log_ent_coef]
-
-    def _record(self, program: Program, source: str) -> None:
-        actor: Any = self.actor
-        critic, target = self.critic, self.critic_target
-        dim = int(np.prod(self.action_space.shape or ()))
-        batch = self._record_transitions(program, source, actor.features_dim, dim)
-
-        def act(obs: Any, noise: str) -> Any:
-            latent = program.network(parts(actor.latent_pi), obs)
-            mean = program.network(parts(actor.mu), latent)
-            log_std = program.network(parts(actor.log_std), latent)
-            action, log_prob = squashed_gaussian(
-                mean, log_std.clamp(LOG_STD_MIN, LOG_STD_MAX), program.input(noise, dim),
-                actor.action_dist.epsilon,
-            )  # fmt: skip
-            program.check(log_prob, noise)
-            return action, log_prob
-
-        action, log_prob = act(batch.obs, "noise")
-        if self.ent_coef_optimizer is not None:
-            assert self.log_ent_coef is not None
-            log_ent_coef = program.parameter(self.log_ent_coef)
-            ent_coef = log_ent_coef.exp().detach()
-            apart = (log_prob + program.scalar("target_entropy")).detach()
-            ent_coef_loss = -(log_ent_coef * apart).mean()
-            program.log("ent_coef_loss", ent_coef_loss)
-            program.minimise(ent_coef_loss, self.ent_coef_optimizer)
-        else:
-            ent_coef = program.scalar("ent_coef")
-        program.log("ent_coef", ent_coef)
-
-        next_action, next_log_prob = act(batch.next_obs, "next_noise")
-        before = program.joined([batch.next_obs, next_action])
-        next_q = least_of([program.network(parts(q), before) for q in target.q_networks])
-        next_value = next_q - ent_coef * next_log_prob
-        target_q = batch.rewards + batch.not_done * batch.discounts * next_value
-        taken = program.joined([batch.obs, batch.actions])
+    def _critic_loss(self, program: Program, x: Value, target: Value) -> Value:
         losses = [
-            (program.network(parts(q), taken) - target_q.detach()).square().mean()
-            for q in critic.q_networks
+            (program.network(parts(q), x) - target).square().mean() for q in self.critic.q_networks
         ]
-        critic_loss = sum(losses[1:], losses[0]) * 0.5
-        program.log("critic_loss", critic_loss)
-        program.minimise(critic_loss, critic.optimizer)
+        return sum(losses[1:], losses[0]) * 0.5
 
-        now = program.joined([batch.obs, action])
-        q = least_of([program.network(parts(q), now) for q in critic.q_networks])
-        actor_loss = (ent_coef * log_prob - q).mean()
-        program.log("actor_loss", actor_loss)
-        program.minimise(actor_loss, actor.optimizer)
-        program.mark("target update")
-        for one, two in zip(critic.q_networks, target.q_networks, strict=True):
-            program.polyak_update(parts(one), parts(two), program.scalar("tau"))
-
-    def _train_fused(self, gradient_steps: int, batch_size: int = 64) -> None:
-        source = self._start_round()
-        names = ("ent_coef", "actor_loss", "critic_loss", "ent_coef_loss")  # in SB3's order
-        logged: dict[str, list[float]] = {name: [] for name in names}
-        for step in range(gradient_steps):
-            machine, data = self._next_batch(batch_size, source)
-            shape = (machine.batch, *(self.action_space.shape or ()))
-            machine.inputs.load({"noise": th.randn(shape), "next_noise": th.randn(shape)})
-            machine.set({"target_entropy": float(self.target_entropy), "tau": self.tau})
-            if self.ent_coef_optimizer is None:
-                machine.set({"ent_coef": float(self.ent_coef_tensor)})
-            last = (
-                None if step % self.target_update_interval == 0 else machine.marks["target update"]
-            )
-            machine.run(0, last, partial(self._raise_error, machine, data))
-            for name in machine.program.logged:
-                logged[name].append(machine.number(name))
-        self._n_updates += gradient_steps
-        self._log_round(logged)
-
-    def _raise_error(self, machine: Machine, data: Any, noise: str) -> None:
-        """Let SB3's distribution raise its error, e.g. for means that are not finite."""
-        obs = self._observations(machine, data, next_ones=noise == "next_noise")
-        with th.no_grad(), th.random.fork_rng(devices=[]):
-            self.actor.action_log_prob(obs)
+    def _value(self, program: Program, x: Value) -> Value:
+        return least_of([program.network(parts(q), x) for q in self.critic.q_networks])

@@ -245,17 +245,56 @@ class Value:
         self.program.record("MAX_FEATURES", made, self, first=self.features)
         return made
 
-    def pick(self, index: Value) -> Value:
-        """Select the feature with number ``index``."""
+    def argmax_features(self) -> Value:
+        """Find the number of the largest feature, the first of equal ones."""
         made = Value(self.program, 1, self.batched)
+        self.program.record("ARGMAX", made, self, first=self.features)
+        return made
+
+    def sum_blocks(self, size: int) -> Value:
+        """Sum consecutive blocks of ``size`` features, without a gradient."""
+        made = Value(self.program, size, self.batched)
+        self.program.record("SUM_FEATURES", made, self, first=self.features)
+        return made
+
+    def sort_features(self) -> Value:
+        """Sort the features of each entry, the smallest first, without a gradient."""
+        made = Value(self.program, self.features, self.batched)
+        self.program.record("SORT", made, self)
+        return made
+
+    def pick(self, index: Value, size: int | None = None) -> Value:
+        """Select the feature with number ``index``.
+
+        :param size: select one in each block of this many features; None: all are one block
+        """
+        size = self.features if size is None else size
+        made = Value(self.program, self.features // size, self.batched)
 
         def back(g: Value) -> Value:
             put = Value(self.program, self.features, self.batched)
-            self.program.record("PUT", put, g, index)
+            self.program.record("PUT", put, g, index, first=size)
             return put
 
         made.parents = ((self, back),)
-        self.program.record("PICK", made, self, index, first=self.features)
+        self.program.record("PICK", made, self, index, first=size)
+        return made
+
+    def quantile_huber(self, targets: Value) -> Value:
+        """Compute the quantile Huber loss of each feature, summed over ``targets``.
+
+        The features are estimates of evenly spaced quantiles of what the targets are samples of.
+        The targets get no gradient.
+
+        Source: arXiv:1710.10044, equation 10.
+        """
+        count = self.features
+        both = Value(self.program, 2 * count, True)  # losses, then their derivatives
+        self.program.record(
+            "QUANTILE_HUBER", both, self, targets, first=count, last=targets.features
+        )
+        made, slope = both.view(0, count), both.view(count, 2 * count)
+        made.parents = ((self, lambda g: g * slope),)
         return made
 
     def sum(self) -> Value:

@@ -5,9 +5,8 @@ from __future__ import annotations
 import copy
 
 import pytest
-import stable_baselines3
 import torch as th
-from algorithms_support import assert_alike, learn, make, reason_of
+from algorithms_support import STOCK, assert_alike, learn, make, reason_of
 from stable_baselines3.common.distributions import (
     DiagGaussianDistribution,
     SquashedDiagGaussianDistribution,
@@ -41,7 +40,7 @@ class Ear(Logger):
 def assert_falls_back(name, why, change=lambda model: None, env=lambda: None, **kwargs):
     """Two rounds of training, since the log shall not say it again in the second."""
     models = []
-    for which in (sb3_sparse, stable_baselines3):
+    for which in (sb3_sparse, STOCK):
         arguments = {key: dict(v) if isinstance(v, dict) else v for key, v in kwargs.items()}
         model = make(which, name, env(), **arguments)
         change(model)
@@ -284,9 +283,33 @@ def test_what_comes_and_goes_is_followed():
 
     reasons = []
     ours = train(sb3_sparse)
-    assert_alike(ours, train(stable_baselines3))
+    assert_alike(ours, train(STOCK))
     assert reasons == ["hooks on modules", None]
     assert ours._trains().reason is None
+
+
+@pytest.mark.parametrize(
+    ("name", "setting", "values"),
+    [("TQC", "top_quantiles_to_drop_per_net", (0, 3)), ("QRDQN", "max_grad_norm", (0.01, None))],
+)
+def test_settings_that_change_the_program_are_followed(name, setting, values):
+    def train(library):
+        model = learn(make(library, name))
+        for value in values:
+            setattr(model, setting, value)
+            learn(model, steps=5)
+        return model
+
+    ours = train(sb3_sparse)
+    assert ours.why_not_fused() is None
+    assert_alike(ours, train(STOCK))
+
+
+def test_targets_without_any_quantile_are_stock_training():
+    kwargs = dict(policy_kwargs=dict(n_quantiles=6), top_quantiles_to_drop_per_net=6)
+    ours, stock = (learn(make(library, "TQC", **kwargs)) for library in (sb3_sparse, STOCK))
+    assert reason_of(ours) == "a target of 0 among 12 quantiles"
+    assert_alike(ours, stock)
 
 
 @pytest.mark.parametrize("name", ["SAC", "A2C"])
@@ -298,7 +321,7 @@ def test_settings_of_activations_are_followed(name):
                 module.negative_slope = 0.5
         return learn(model, steps=10)
 
-    assert_alike(train(sb3_sparse), train(stable_baselines3))
+    assert_alike(train(sb3_sparse), train(STOCK))
 
 
 @pytest.mark.parametrize(

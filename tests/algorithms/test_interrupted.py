@@ -13,6 +13,7 @@ import torch as th
 from algorithms_support import (
     NAMES,
     OFF_POLICY,
+    STOCK,
     Noise,
     actions_of,
     assert_alike,
@@ -28,13 +29,13 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 import sb3_sparse
 
-LIBRARIES = (sb3_sparse, stable_baselines3)
+LIBRARIES = (sb3_sparse, STOCK)
 MORE = {"PPO": 32, "A2C": 50}
 
 
 def more(model, callback=None):
     """Ten gradient steps from here, of random numbers that are the same for all models."""
-    name = next(name for name in NAMES[::-1] if isinstance(model, getattr(stable_baselines3, name)))
+    name = next(name for name in NAMES[::-1] if isinstance(model, getattr(STOCK, name)))
     set_random_seed(5)
     model.action_space.seed(5)
     return learn(model, callback, MORE.get(name, 10))
@@ -45,7 +46,7 @@ def more(model, callback=None):
 def test_files_go_from_ours_to_stock_and_back(name, storage, tmp_path):
     ours = learn(make(sb3_sparse, name, policy_kwargs=dict(compute=storage)))
     assert type(ours).__name__ == name
-    assert isinstance(ours, getattr(stable_baselines3, name))
+    assert isinstance(ours, getattr(STOCK, name))
     ours.save(tmp_path / "ours")
     if name in OFF_POLICY:
         ours.save_replay_buffer(tmp_path / "buffer")
@@ -56,8 +57,8 @@ def test_files_go_from_ours_to_stock_and_back(name, storage, tmp_path):
             model.load_replay_buffer(tmp_path / "buffer")
         return model
 
-    stock = load(stable_baselines3, "ours")
-    assert type(stock) is getattr(stable_baselines3, name)
+    stock = load(STOCK, "ours")
+    assert type(stock) is getattr(STOCK, name)
     before = tensors_of(ours)
     for key, tensor in tensors_of(stock).items():
         th.testing.assert_close(tensor, before[key], rtol=0, atol=0)
@@ -69,7 +70,7 @@ def test_files_go_from_ours_to_stock_and_back(name, storage, tmp_path):
     stock.save(tmp_path / "stock")
     back = load(sb3_sparse, "stock")
     more(back)
-    more(stock := load(stable_baselines3, "stock"))
+    more(stock := load(STOCK, "stock"))
     assert fused(back)
     assert_alike(back, stock)
 
@@ -119,7 +120,7 @@ def set_rate(model):
 def load_weights(model):
     """Those of a model that has trained elsewhere."""
     state = th.random.get_rng_state()
-    other = make(stable_baselines3, type(model).__name__, seed=11)
+    other = make(STOCK, type(model).__name__, seed=11)
     th.random.set_rng_state(state)
     model.set_parameters(other.get_parameters())
 
@@ -220,7 +221,7 @@ def test_an_interrupted_run_goes_on(name):
 def test_checkpoints_and_statistics_are_true_at_any_moment(tmp_path):
     folders = []
     for library in LIBRARIES:
-        folders.append(tmp_path / library.__name__)
+        folders.append(tmp_path / str(len(folders)))
         callback = CheckpointCallback(30, str(folders[-1]), save_replay_buffer=True)
         learn(make(library, "SAC"), callback)
     loaded = [stable_baselines3.SAC.load(folder / "rl_model_30_steps") for folder in folders]
@@ -259,7 +260,7 @@ def test_two_threads_agree_with_one(name, storage):
 
 @pytest.mark.parametrize("name", ["SAC", "DQN", "PPO"])
 def test_every_instruction_set(name, instructions):
-    stock = learn(make(stable_baselines3, name), moving("rigl"))
+    stock = learn(make(STOCK, name), moving("rigl"))
     ours = learn(make(sb3_sparse, name), moving("rigl"))
     assert_alike(ours, stock)
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import pytest
-import stable_baselines3
 from algorithms_support import (
+    DISCRETE,
     METHODS,
     NAMES,
+    STOCK,
     assert_alike,
     assert_like_stock,
     learn,
@@ -70,7 +71,7 @@ MIXED = [
 
 @pytest.mark.parametrize("storage", ["masked", "sparse"])
 @pytest.mark.parametrize(("methods", "start"), MIXED, ids=[str(methods) for methods, _ in MIXED])
-@pytest.mark.parametrize("name", [name for name in NAMES if name != "DQN"])
+@pytest.mark.parametrize("name", [name for name in NAMES if name not in DISCRETE])
 def test_a_method_for_each_network(name, methods, start, storage):
     kwargs = dict(compute=storage, sparsity=0.7, initial_sparsity=start)
     options = dict(update_interval={"actor": 2, "critic": 3}, begin=0.0, end=1.0)
@@ -122,6 +123,8 @@ WRONG = [
     ("DQN", {}, dict(gamma=0.98)),
     ("DQN", {}, dict(max_grad_norm=0.1)),
     ("DQN", {}, dict(target_update_interval=11)),
+    ("TQC", {}, dict(top_quantiles_to_drop_per_net=1)),
+    ("QRDQN", {}, dict(max_grad_norm=0.1)),
     ("PPO", dict(ent_coef=1e-3), dict(ent_coef=0.0)),
     ("PPO", {}, dict(vf_coef=0.51)),
     ("PPO", {}, dict(clip_range=0.01)),
@@ -135,7 +138,7 @@ WRONG = [
 
 @pytest.mark.parametrize(("name", "common", "wrong"), WRONG)
 def test_the_comparison_notices_a_wrong_setting(name, common, wrong):
-    stock = learn(make(stable_baselines3, name, **common))
+    stock = learn(make(STOCK, name, **common))
     ours = learn(make(sb3_sparse, name, **{**common, **wrong}))
     with pytest.raises(AssertionError):
         assert_alike(ours, stock)

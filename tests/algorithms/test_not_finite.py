@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import pytest
-import stable_baselines3
 import torch as th
-from algorithms_support import Noise, fused, learn, make, tensors_of
+from algorithms_support import STOCK, Noise, fused, learn, make, tensors_of
 from gymnasium import spaces
 from stable_baselines3.common.utils import set_random_seed
 
@@ -26,6 +25,8 @@ PLACES = {
     "SAC": ["actor.latent_pi", "actor.mu", "actor.log_std", "critic.qf0", "critic_target.qf1"],
     "TD3": ["actor.mu", "actor_target.mu", "critic.qf0", "critic_target.qf1"],
     "DQN": ["q_net.q_net", "q_net_target.q_net"],
+    "TQC": ["actor.latent_pi", "actor.mu", "actor.log_std", "critic.qf0", "critic_target.qf1"],
+    "QRDQN": ["quantile_net.quantile_net", "quantile_net_target.quantile_net"],
     "PPO": ["mlp_extractor.policy_net", "action_net", "value_net"],
     "A2C": ["mlp_extractor.policy_net", "action_net", "value_net"],
 }
@@ -66,7 +67,7 @@ def assert_as_finite(ours, stock):
 
 def assert_ends_alike(name, spoil, env=lambda: None, **kwargs):
     ours, ended = end_of(sb3_sparse, name, spoil, env(), **kwargs)
-    stock, should = end_of(stable_baselines3, name, spoil, env(), **kwargs)
+    stock, should = end_of(STOCK, name, spoil, env(), **kwargs)
     assert fused(ours)
     assert type(ended) is type(should), (ended, should)
     if should is not None:
@@ -122,11 +123,11 @@ def test_without_checks_training_goes_on(name, monkeypatch):
     assert assert_ends_alike(name, spoil) is None
 
 
-@pytest.mark.parametrize("name", ["SAC", "TD3", "DQN"])
+@pytest.mark.parametrize("name", ["SAC", "TD3", "DQN", "TQC", "QRDQN"])
 def test_rewards_that_are_not_finite(name):
     for number in (NAN, INF, 1e30):
         models = []
-        for library in (sb3_sparse, stable_baselines3):
+        for library in (sb3_sparse, STOCK):
             model = make(library, name, policy_kwargs=dict(sparsity=0.0))
             learn(model, steps=50)
             model.replay_buffer.rewards[:] = number

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import pytest
-import stable_baselines3
 import torch as th
 from algorithms_support import (
+    STOCK,
     assert_alike,
     assert_like_stock,
     fused,
@@ -18,7 +18,7 @@ from torch.optim.optimizer import register_optimizer_step_post_hook
 
 import sb3_sparse
 
-LIBRARIES = (sb3_sparse, stable_baselines3)
+LIBRARIES = (sb3_sparse, STOCK)
 
 
 class OwnAdam(th.optim.Adam):
@@ -144,7 +144,7 @@ def test_hooks_on_all_optimizers():
         learn(make(sb3_sparse, "SAC"))
         ours = calls[:]
         calls.clear()
-        learn(make(stable_baselines3, "SAC"))
+        learn(make(STOCK, "SAC"))
     finally:
         handle.remove()
     assert len(calls) >= 60
@@ -159,7 +159,7 @@ def test_a_hook_that_comes_and_goes():
         handle.remove()
         return learn(model, steps=5), len(calls)
 
-    (ours, one), (stock, two) = train(sb3_sparse), train(stable_baselines3)
+    (ours, one), (stock, two) = train(sb3_sparse), train(STOCK)
     assert_alike(ours, stock)
     assert one == two == 5
 
@@ -176,7 +176,7 @@ def test_another_optimizer_in_the_middle(name):
                 network.optimizer = holder.optimizer
         return learn(model, steps=20)
 
-    assert_alike(train(sb3_sparse), train(stable_baselines3))
+    assert_alike(train(sb3_sparse), train(STOCK))
 
 
 @pytest.mark.parametrize("name", ["SAC", "DQN", "PPO", "A2C"])

@@ -10,6 +10,7 @@ import pytest
 import stable_baselines3
 from algorithms_support import (
     BOX,
+    STOCK,
     Noise,
     assert_alike,
     assert_like_stock,
@@ -61,6 +62,16 @@ OPTIONS = [
     ("DQN", dict(max_grad_norm=0.05, tau=0.3)),
     ("DQN", dict(n_steps=3, gradient_steps=2, train_freq=2)),
     ("DQN", dict(learning_rate=Linear(1e-3), gamma=0.5)),
+    ("TQC", dict(top_quantiles_to_drop_per_net=0)),
+    ("TQC", dict(top_quantiles_to_drop_per_net=5, n_steps=3, gamma=0.7)),
+    ("TQC", dict(ent_coef=0.1, gradient_steps=3, target_update_interval=2, train_freq=3)),
+    ("TQC", dict(learning_rate=Linear(1e-3), tau=0.5, policy_kwargs=dict(weight_decay=1e-2))),
+    ("TQC", dict(policy_kwargs=dict(n_critics=3, n_quantiles=25, net_arch=[20]))),
+    ("TQC", dict(policy_kwargs=dict(n_critics=1, n_quantiles=1), top_quantiles_to_drop_per_net=0)),
+    ("QRDQN", dict(max_grad_norm=0.05, tau=0.3)),
+    ("QRDQN", dict(n_steps=3, gradient_steps=2, train_freq=2, learning_rate=Linear(1e-3))),
+    ("QRDQN", dict(policy_kwargs=dict(n_quantiles=1, net_arch=[]))),
+    ("QRDQN", dict(policy_kwargs=dict(n_quantiles=200), gamma=0.5)),
     ("PPO", dict(clip_range=Linear(0.01), clip_range_vf=Linear(0.02), learning_rate=Linear(1e-3))),
     ("PPO", dict(normalize_advantage=False, ent_coef=0.05, vf_coef=0.1, max_grad_norm=0.05)),
     ("PPO", dict(target_kl=1e-3, learning_rate=3e-3, clip_range=0.02)),
@@ -210,7 +221,7 @@ class Goals(gym.Env):
 def test_hindsight_replay_is_stock_training():
     models = [
         learn(make(library, "SAC", Goals(), replay_buffer_class=stable_baselines3.HerReplayBuffer))
-        for library in (sb3_sparse, stable_baselines3)
+        for library in (sb3_sparse, STOCK)
     ]
     assert "CombinedExtractor" in reason_of(models[0])
     assert_alike(*models, exact=True)

@@ -8,6 +8,7 @@ import torch as th
 from algorithms_support import make
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from sb3_contrib.common.utils import quantile_huber_loss
 from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
 
 import sb3_sparse
@@ -22,14 +23,14 @@ FEATURES = 3
 
 
 class Room:
-    """A program on one vector of parameters and no network."""
+    """A program on one vector of parameters and no network, with as many inputs."""
 
     def __init__(self, build, batch, optimizer=th.optim.Adam, start=None, **kwargs):
         start = th.zeros(FEATURES) if start is None else start
         self.vector = th.nn.Parameter(start.clone())
         self.optimizer = optimizer([self.vector], **kwargs)
         program = Program()
-        x = program.input("x", FEATURES)
+        x = program.input("x", len(start))
         loss = build(program, x, program.parameter(self.vector))
         program.log("loss", loss)
         program.minimise(loss, self.optimizer)
@@ -114,6 +115,78 @@ def test_a_part_of_the_features():
     loss.backward()
     assert ours == pytest.approx(float(loss), abs=1e-6)
     np.testing.assert_allclose(grad, vector.grad, atol=1e-6)
+
+
+NUMBERS = st.floats(width=32, allow_nan=True, allow_infinity=True)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(NUMBERS, min_size=1, max_size=70))
+def test_features_are_sorted_as_by_torch(numbers):
+    x = th.tensor([numbers], dtype=th.float32)
+    start = th.zeros(len(numbers))
+    _, grad = gradient_of(lambda _, a, b: (a.sort_features() * b).sum().sum_features(), x, start)
+    assert np.array_equal(grad, x.sort().values[0], equal_nan=True)
+
+
+@pytest.mark.parametrize("batch", [1, 63, 64, 65, 200])
+@pytest.mark.parametrize("features", [1, 2, 7, 8, 50])
+def test_each_entry_is_sorted_by_itself(features, batch, instructions):
+    x = th.randn(batch, features, generator=th.Generator().manual_seed(features))
+    start = th.zeros(features)
+    _, grad = gradient_of(lambda _, a, b: (a.sort_features() * b).sum().sum_features(), x, start)
+    np.testing.assert_allclose(grad, x.sort().values.sum(0), rtol=1e-5, atol=1e-5)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.sampled_from([-1.0, 0.0, 2.0, float("inf"), float("nan")]), min_size=1))
+def test_the_largest_feature_is_the_first_of_equal_ones(numbers):
+    room = Room(
+        lambda _, a, b: (a.argmax_features() + b[0:1] * 0.0).sum(), 1, th.optim.SGD,
+        th.zeros(len(numbers)), lr=0.0,
+    )  # fmt: skip
+    assert room.step(th.tensor([numbers])) == np.argmax(numbers)  # NaN is the largest
+
+
+@pytest.mark.parametrize("batch", [1, 65])
+@pytest.mark.parametrize(("blocks", "size"), [(1, 4), (4, 1), (3, 5)])
+def test_one_feature_of_each_block(blocks, size, batch):
+    random = th.Generator().manual_seed(blocks)
+    x = th.randn(batch, blocks * size, generator=random)
+    start = th.randn(blocks * size, generator=random)
+
+    def build(program, a, b):
+        totals = a.sum_blocks(size)
+        return (a * b).pick(totals.argmax_features(), size).square().mean()
+
+    ours, grad = gradient_of(build, x, start)
+    vector = start.clone().requires_grad_()
+    best = x.view(batch, blocks, size).sum(1).argmax(1)
+    picked = (x * vector).view(batch, blocks, size)[th.arange(batch), :, best]
+    loss = picked.square().mean()
+    loss.backward()
+    assert ours == pytest.approx(float(loss.detach()), rel=1e-5)
+    np.testing.assert_allclose(grad, vector.grad, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("batch", [1, 65, 200])
+@pytest.mark.parametrize(("estimates", "targets"), [(1, 1), (1, 6), (6, 1), (7, 46)])
+def test_the_loss_of_quantiles_is_that_of_sb3_contrib(estimates, targets, batch, instructions):
+    random = th.Generator().manual_seed(targets)
+    size = max(estimates, targets)
+    x, start = (3 * th.randn(*shape, generator=random) for shape in ((batch, size), (size,)))
+
+    def build(program, a, b):
+        loss = (a + b)[0:estimates].quantile_huber(a[0:targets]).sum_features()
+        return loss.mean() * (1 / targets)
+
+    ours, grad = gradient_of(build, x, start)
+    vector = start.double().requires_grad_()
+    current = (x.double() + vector)[:, :estimates]
+    loss = quantile_huber_loss(current, x[:, :targets].double(), sum_over_quantiles=True)
+    loss.backward()
+    assert ours == pytest.approx(float(loss.detach()), rel=1e-5)
+    np.testing.assert_allclose(grad, vector.grad, rtol=1e-4, atol=1e-6)
 
 
 def results_of(function, numbers):

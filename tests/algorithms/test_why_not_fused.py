@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import stable_baselines3
 import torch as th
-from algorithms_support import NAMES
+from algorithms_support import NAMES, STOCK
 from support import make
 
 import sb3_sparse
@@ -116,7 +115,7 @@ def test_the_log_says_nothing_where_there_is_nothing_to_say(name, arguments, cap
 def test_dense_policies_train_as_in_stock_to_the_bit():
     stock, own = (
         make(package.SAC, policy="MlpPolicy").learn(60).policy.state_dict()
-        for package in (stable_baselines3, sb3_sparse)
+        for package in (STOCK, sb3_sparse)
     )
     for key, value in stock.items():
         assert th.equal(value, own[key]), key

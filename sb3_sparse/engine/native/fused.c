@@ -156,34 +156,97 @@ static void fill(const operation_t *o, const where_t *where) {
             to[f * TILE + e] = e < where->entries ? a[f * o->a.feature] : 0;
 }
 
-/* Over features; `first` is how many the operand has. */
+/* Puts the smaller of two features first, in each lane; a NaN is greater than all. */
+INLINE void in_order(float *one, float *two, int64_t numbers) {
+    for (int64_t j = 0; j < numbers; j += WIDTH) {
+        vec x = LOAD(one + j), y = LOAD(two + j);
+        ivec swap = (y < x) | ((x != x) & (y == y));
+        STORE(one + j, choose(swap, y, x));
+        STORE(two + j, choose(swap, x, y));
+    }
+}
+
+/* Batcher's odd-even merge sort, for any number of features. */
+static void sort_features(float *x, int64_t features, int64_t numbers) {
+    for (int64_t p = 1; p < features; p *= 2)
+        for (int64_t k = p; k >= 1; k /= 2)
+            for (int64_t j = k % p; j + k < features; j += 2 * k)
+                for (int64_t i = j; i < j + k && i + k < features; i++)
+                    if (i / (2 * p) == (i + k) / (2 * p))
+                        in_order(x + i * TILE, x + (i + k) * TILE, numbers);
+}
+
+/* For each estimate a of a quantile, the loss to all targets b and its derivative: the Huber loss
+   of their distance, weighted by the quantile's share where the target is not below, else by the
+   rest. `first` is the number of estimates, `last` that of targets. */
+static void quantile_huber(const operation_t *o, const where_t *where) {
+    const float *a = at(&o->a, where), *b = at(&o->b, where);
+    float *to = at(&o->to, where);
+    for (int64_t q = 0; q < o->first; q++) {
+        float share = (q + 0.5f) / o->first;
+        for (int64_t j = 0; j < where->vectors; j++) {
+            vec x = LOAD(a + q * o->a.feature + j * WIDTH), loss = {0}, slope = {0};
+            for (int64_t t = 0; t < o->last; t++) {
+                vec d = LOAD(b + t * o->b.feature + j * WIDTH) - x;
+                vec weight = choose(d < 0, 1 - share + (vec){0}, share + (vec){0});
+                loss += weight * huber(d);
+                slope -= weight * (at_least(at_most(d, 1), -1) + 0 * d); /* NaN for infinity */
+            }
+            STORE(to + q * o->to.feature + j * WIDTH, loss);
+            STORE(to + (o->first + q) * o->to.feature + j * WIDTH, slope);
+        }
+    }
+}
+
+/* Over features. An operand of several blocks has `first` features, or `first` in each. */
 static void over_features(const operation_t *o, const where_t *where) {
     const float *a = at(&o->a, where), *b = at(&o->b, where);
     float *to = at(&o->to, where);
     int64_t numbers = where->vectors * WIDTH;
     switch (o->kind) {
-    case SUM_FEATURES:
+    case SUM_FEATURES: /* of all blocks, for each feature of the result */
+        for (int64_t g = 0; g < o->features; g++)
+            for (int64_t j = 0; j < numbers; j += WIDTH) {
+                vec found = LOAD(a + g * o->a.feature + j);
+                for (int64_t f = g + o->features; f < o->first; f += o->features)
+                    found += LOAD(a + f * o->a.feature + j);
+                STORE(to + g * o->to.feature + j, found);
+            }
+        break;
     case MAX_FEATURES:
+    case ARGMAX: /* the number of the first one */
         for (int64_t j = 0; j < numbers; j += WIDTH) {
-            vec found = LOAD(a + j);
+            vec found = LOAD(a + j), number = {0};
             for (int64_t f = 1; f < o->first; f++) {
                 vec x = LOAD(a + f * o->a.feature + j);
-                found = o->kind == SUM_FEATURES ? found + x : choose((x > found) | (x != x), x, found);
+                ivec more = (x > found) | ((x != x) & (found == found));
+                found = choose(more, x, found);
+                number = choose(more, (float)f + (vec){0}, number);
             }
-            STORE(to + j, found);
+            STORE(to + j, o->kind == ARGMAX ? number : found);
         }
         break;
-    case PICK: /* the feature whose number is b */
-        for (int64_t e = 0; e < numbers; e++) {
-            int64_t f = (int64_t)b[e];
-            to[e] = f >= 0 && f < o->first ? a[f * o->a.feature + e] : NAN;
-        }
+    case PICK: /* of each block the feature whose number is b */
+        for (int64_t g = 0; g < o->features; g++)
+            for (int64_t e = 0; e < numbers; e++) {
+                int64_t f = (int64_t)b[e];
+                int is_one = f >= 0 && f < o->first;
+                to[g * o->to.feature + e] = is_one ? a[(g * o->first + f) * o->a.feature + e] : NAN;
+            }
         break;
-    case PUT: /* a at the feature whose number is b, else 0 */
-        for (int64_t f = 0; f < o->features; f++)
+    case PUT: /* the block's number in a at the feature whose number is b, else 0 */
+        for (int64_t f = 0; f < o->features; f++) {
+            const float *from = a + f / o->first * o->a.feature;
             for (int64_t e = 0; e < numbers; e++)
-                to[f * o->to.feature + e] = (int64_t)b[e] == f ? a[e] : 0;
+                to[f * o->to.feature + e] = (int64_t)b[e] == f % o->first ? from[e] : 0;
+        }
         break;
+    case SORT: /* the smallest ones, in the order of their size */
+        for (int64_t f = 0; f < o->features; f++)
+            memcpy(to + f * TILE, a + f * o->a.feature, numbers * sizeof *to);
+        sort_features(to, o->features, numbers);
+        break;
+    case QUANTILE_HUBER: quantile_huber(o, where); break;
     }
 }
 
@@ -267,7 +330,8 @@ static void linear_grad(const operation_t *o, const where_t *where) {
 static void run_tiled(const operation_t *o, const where_t *where) {
     switch (o->kind) {
     case FILL: fill(o, where); break;
-    case SUM_FEATURES: case MAX_FEATURES: case PICK: case PUT: over_features(o, where); break;
+    case SUM_FEATURES: case MAX_FEATURES: case PICK: case PUT: case ARGMAX: case SORT:
+    case QUANTILE_HUBER: over_features(o, where); break;
     case LOAD_ROWS: load_rows(o, where); break;
     case LINEAR: linear(o, where); break;
     case LINEAR_BACK: linear_back(o, where); break;

@@ -91,7 +91,7 @@ enum {
     ACTIVATION, SLOPE_RESULT, SLOPE_INPUT,         /* to = a * slope at b */
     FILL,                                         /* a, but 0 beyond the batch */
     /* over features */
-    SUM_FEATURES, MAX_FEATURES, PICK, PUT,
+    SUM_FEATURES, MAX_FEATURES, PICK, PUT, ARGMAX, SORT, QUANTILE_HUBER,
     /* layers and inputs */
     LOAD_ROWS, LINEAR, LINEAR_BACK, LINEAR_GRAD, LINEAR_DENSE_GRAD,
     /* once */
