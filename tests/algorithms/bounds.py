@@ -14,10 +14,17 @@ from sb3_sparse.engine.native import library
 from sb3_sparse.fused import tables
 
 
+MODELS = [
+    *(("SAC", "sparse"), ("DQN", "masked"), ("PPO", "masked")),
+    *(("TQC", "sparse"), ("QRDQN", "masked")),
+]
+"""Algorithms and storages."""
+
+
 def train(instructions: str) -> None:
     library.use(instructions)
     th.set_num_threads(2)
-    for name, compute in (("SAC", "sparse"), ("DQN", "masked"), ("PPO", "masked")):
+    for name, compute in MODELS:
         model = make(sb3_sparse, name, policy_kwargs=dict(sparsity=0.6, compute=compute))
         model.learn(48, callback=sb3_sparse.SparsityCallback("rigl", update_interval=4))
         assert model.why_not_fused() is None
