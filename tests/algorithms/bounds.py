@@ -13,7 +13,6 @@ import sb3_sparse
 from sb3_sparse.engine.native import library
 from sb3_sparse.fused import tables
 
-
 MODELS = [
     *(("SAC", "sparse"), ("DQN", "masked"), ("PPO", "masked")),
     *(("TQC", "sparse"), ("QRDQN", "masked")),
