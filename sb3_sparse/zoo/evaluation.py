@@ -166,8 +166,8 @@ class Evaluation(EvalCallback):
         self.evaluations_successes = saved.successes
 
     def _init_callback(self) -> None:
-        super()._init_callback()  # makes the folder
-        (self.folder / UNFINISHED).rmdir()
+        super()._init_callback()  # makes the folder, if a kill has not left one with files
+        shutil.rmtree(self.folder / UNFINISHED)
 
     def _on_training_start(self) -> None:
         self.next = (self.model.num_timesteps // self.every + 1) * self.every

@@ -152,13 +152,13 @@ def test_a_dense_run_is_not_called_sparse(tmp_path):
 
 def test_algorithms_of_sb3_contrib_are_imported_from_there(tmp_path):
     run = RunSpec(
-        "tqc", "Pendulum-v1", n_timesteps=60, eval_freq=60, eval_episodes=1, hyperparams=QUICK
+        "crossq", "Pendulum-v1", n_timesteps=60, eval_freq=60, eval_episodes=1, hyperparams=QUICK
     )
     text = str(Card.of(train(run, tmp_path).folder))
     code = blocks(text, "python")[1]
     assert code.splitlines()[:2] == [
         "import sb3_sparse  # registers the sparse policies",
-        "from sb3_contrib import TQC",
+        "from sb3_contrib import CrossQ",
     ]
 
 

@@ -596,6 +596,16 @@ def test_a_dense_run_of_equal_parameters_says_what_it_reached(tmp_path):
     assert (told.target, told.achieved) == (match["target"], match["achieved"])
 
 
+def test_a_kill_within_an_evaluation_costs_nothing(tmp_path):
+    stopped = train(DQN_RUN, tmp_path, [Stop(250)])
+    (
+        stopped.folder / "unfinished"
+    ).mkdir()  # where an evaluation puts its files
+    (stopped.folder / "unfinished" / "best_model.zip").write_bytes(b"the first part")
+    assert resume(stopped.folder).finished
+    assert not (stopped.folder / "unfinished").exists()
+
+
 def test_tensorboard_goes_on_in_the_same_folder(tmp_path):
     log = str(tmp_path / "tb")
     stopped = train(DQN_RUN, tmp_path / "logs", [Stop(250)], tensorboard_log=log)
