@@ -598,9 +598,7 @@ def test_a_dense_run_of_equal_parameters_says_what_it_reached(tmp_path):
 
 def test_a_kill_within_an_evaluation_costs_nothing(tmp_path):
     stopped = train(DQN_RUN, tmp_path, [Stop(250)])
-    (
-        stopped.folder / "unfinished"
-    ).mkdir()  # where an evaluation puts its files
+    (stopped.folder / "unfinished").mkdir()  # where an evaluation puts its files
     (stopped.folder / "unfinished" / "best_model.zip").write_bytes(b"the first part")
     assert resume(stopped.folder).finished
     assert not (stopped.folder / "unfinished").exists()
