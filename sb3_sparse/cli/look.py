@@ -18,6 +18,7 @@ from sb3_sparse.cli.common import (
     print_score,
     say,
 )
+from sb3_sparse.pages.numbers import counted
 
 
 def enjoy_command(
@@ -52,7 +53,7 @@ def enjoy_command(
         )
     finally:
         progress.close()
-    say(f"Return over {score.episodes} episodes:")
+    say(f"Return over {counted(score.episodes, 'episode')}:")
     whose = ("Best policy:" if best else "Last policy:") if model.is_dir() else "Policy:"
     print_score(whose, score.mean_return, score.std_return, score.model)
     for path in score.videos:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from sb3_sparse.cli.common import print_score, say
 from sb3_sparse.errors import SparsityError, command
-from sb3_sparse.pages.numbers import short
+from sb3_sparse.pages.numbers import counted, short
 
 if TYPE_CHECKING:
     from sb3_sparse.policies.report import SparsityReport
@@ -23,7 +23,8 @@ def tell(outcome: Outcome) -> None:
     error of a measurement may fail it.
     """
     results = outcome.results
-    say(f"Sparsity {outcome.sparsity:.2%}. Return over {results[0].episodes} episodes:")
+    played = counted(results[0].episodes, "episode")
+    say(f"Sparsity {outcome.sparsity:.2%}. Return over {played}:")
     for result in results:
         print_score(f"{result.what}:", result.mean_return, result.std_return, result.path)
     if len(results) > 1:

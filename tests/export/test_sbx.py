@@ -240,7 +240,7 @@ def test_enjoy_plays_a_zip(zips, monkeypatch, capsys):
         monkeypatch, capsys, "enjoy", zips["ppo"], "--env", "Pendulum-v1", "-n", "1"
     )
     assert code == 0, said
-    assert "Return over 1 episodes" in said
+    assert "Return over 1 episode:" in said
 
 
 def test_a_run_brings_its_normalisation(monkeypatch, capsys, tmp_path):
