@@ -74,9 +74,9 @@ def acting_cost(model: BaseAlgorithm) -> ActingCost:
     space = model.observation_space
     if not isinstance(space, spaces.Box) or len(space.shape) != 1:
         raise UnsupportedError("actions are timed on vectors, and these observations are none")
-    observations = random_observations(space, model.get_vec_normalize_env(), OBSERVATIONS)
     with tempfile.TemporaryDirectory() as folder:
         report = export_policy(model, Path(folder) / "policy", "c")
+        observations = random_observations(space, model.get_vec_normalize_env(), OBSERVATIONS)
         library = with_loop(Path(folder) / "policy.c")
         in_c = c_burst(library, np.asarray(observations, np.float32), size_of(model))
         predict = looped(lambda row: model.predict(row, deterministic=True), observations)

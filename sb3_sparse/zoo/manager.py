@@ -18,6 +18,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_sparse.errors import MissingExtra, warn
 from sb3_sparse.policies.saving import load_without_buffer
+from sb3_sparse.zoo.buffers import import_buffers
 from sb3_sparse.zoo.environments import mujoco_warns_once
 from sb3_sparse.zoo.folder import REPLAY_BUFFER, RunFolder, Start
 from sb3_sparse.zoo.replay import end_episodes, restore_buffer
@@ -92,6 +93,7 @@ class RunManager(ExperimentManager):
     def read_hyperparameters(self) -> tuple[dict[str, Any], OrderedDict[str, Any]]:
         """The settings, instead of the YAML file that they came from."""
         hyperparams = with_env_wrappers(self.settings.as_dict())
+        import_buffers(hyperparams)  # rl-zoo evaluates their names
         return hyperparams, OrderedDict(sorted(self.settings.as_dict().items()))
 
     def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:

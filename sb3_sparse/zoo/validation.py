@@ -19,6 +19,7 @@ from sb3_sparse.policies.arguments import arguments_of, import_classes
 from sb3_sparse.policies.config import SPARSITY_MISSING, SparsityConfig
 from sb3_sparse.topology import Methods
 from sb3_sparse.zoo.arguments import kind_of
+from sb3_sparse.zoo.buffers import import_buffers
 from sb3_sparse.zoo.callbacks import CALLBACK, ROBUST_VALUE, package_callbacks
 from sb3_sparse.zoo.names import SET_BY_THE_RUN, Names
 from sb3_sparse.zoo.settings import Settings
@@ -50,6 +51,7 @@ def check_settings(settings: Settings, algorithm: type[BaseAlgorithm]) -> None:
     for name, value in chain.from_iterable((part or {}).items() for part in parts):
         _check_value(algo.lower(), name, value)
     import_classes(dict(kwargs))
+    import_buffers(dict(settings))
     if settings.get("noise_type") is not None and "noise_std" not in settings:
         raise ConfigError("noise_type needs noise_std, e.g. noise_std: 0.1")
     stored = issubclass(algorithm, OffPolicyAlgorithm)

@@ -6,9 +6,11 @@ from statistics import median
 
 import numpy as np
 import pytest
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 from support import TinyImages, make
 
-from sb3_sparse.errors import UnsupportedError
+from sb3_sparse.errors import ConfigError, UnsupportedError
 from sb3_sparse.export.timing import ROUNDS, acting_cost, c_burst, measure, with_loop
 
 
@@ -59,6 +61,12 @@ def test_a_time_of_each_round_is_of_one_action():
 def test_images_are_not_timed():
     with pytest.raises(UnsupportedError, match="timed on vectors"):
         acting_cost(make("DQN", TinyImages()))
+
+
+def test_frames_that_are_stacked_after_normalisation_are_not_timed():
+    envs = VecFrameStack(VecNormalize(make_vec_env("CartPole-v1")), 2)
+    with pytest.raises(ConfigError, match="if its frames were stacked after normalisation"):
+        acting_cost(make("PPO", envs))
 
 
 def test_without_a_compiler_the_reason_is_given(monkeypatch):

@@ -631,6 +631,38 @@ def test_a_wrapper_may_end_episodes(tmp_path):
     assert enjoy(outcome.folder, episodes=2).episodes == 2
 
 
+@pytest.mark.parametrize(
+    ("run", "argument"),
+    [
+        (DQN_RUN, {"replay_buffer_class": "stable_baselines3.common.buffers.NStepReplayBuffer"}),
+        (PPO_RUN, {"rollout_buffer_class": "stable_baselines3.common.buffers.RolloutBuffer"}),
+    ],
+)
+def test_a_buffer_may_be_a_dotted_path(run, argument, tmp_path):
+    ((name, path),) = argument.items()
+    run = replace(run, n_timesteps=100, hyperparams={**run.hyperparams, **argument})
+    model = train(run, tmp_path).model
+    buffer = getattr(model, name.removesuffix("_class"))
+    assert f"{type(buffer).__module__}.{type(buffer).__name__}" == path
+    assert (
+        json.loads((tmp_path / run.algo / f"{run.env_id}_1" / "sparsity.json").read_text())[
+            "settings"
+        ][name]
+        == path
+    )
+
+
+@pytest.mark.parametrize("path", ["no.such.Buffer", "stable_baselines3.NoBuffer"])
+@pytest.mark.parametrize(
+    ("run", "name"), [(DQN_RUN, "replay_buffer_class"), (PPO_RUN, "rollout_buffer_class")]
+)
+def test_a_buffer_that_is_none_is_refused_before_anything(run, name, path, tmp_path):
+    run = replace(run, hyperparams={**run.hyperparams, name: path})
+    with pytest.raises(ConfigError, match=f"^{name}='{path}' cannot be imported"):
+        train(run, tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
 def test_evaluation_has_the_environments_arguments_too(tmp_path):
     run = replace(PPO_RUN, hyperparams={**PPO_RUN.hyperparams, "env_kwargs": {"g": 0.0}})
     made = []
