@@ -17,7 +17,7 @@ two layers, or ``nature`` or ``impala`` for images: of noise, or of an Atari gam
 ``dqn`` takes a gradient step of 128 samples at every step of the environment; ``dqn4`` takes one of
 32 samples at every fourth, which is SB3's default.
 
-    python benchmarks/end_to_end.py                                   # three quarters of an hour
+    python benchmarks/end_to_end.py                                   # about an hour
     python benchmarks/end_to_end.py --cases sac-256,ppo-64@CartPole-v1 --sparsity 0,0.9,0.95
     python benchmarks/end_to_end.py --cases sac-128 --activation elu --method rigl
     python benchmarks/end_to_end.py --cases dqn4-nature@PongNoFrameskip-v4 --sparsity 0.95

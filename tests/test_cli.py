@@ -220,7 +220,10 @@ RUNS = {
 }
 IMPORTS = {
     "typer": ("import sb3_sparse.cli", "sb3-sparse[zoo]"),
-    "sb3_contrib": ("import sb3_sparse; sb3_sparse.SparseTQCPolicy", "sb3-sparse[contrib]"),
+    "sb3_contrib": (
+        "import sb3_sparse; sb3_sparse.TQC",
+        "or TRPO needs sb3-sparse[contrib]",
+    ),
 }
 
 

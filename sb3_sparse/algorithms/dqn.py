@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import stable_baselines3
-import torch as th
 
-from sb3_sparse.algorithms.off_policy import OffPolicy
+from sb3_sparse.algorithms.q_learning import QLearning
 from sb3_sparse.fused.parts import parts
 from sb3_sparse.fused.program import Program
 
 
-class DQN(OffPolicy, stable_baselines3.DQN):
+class DQN(QLearning, stable_baselines3.DQN):
     """Stable-Baselines3's DQN with fused gradient steps, if the policy is sparse.
 
     Example::
@@ -26,10 +25,6 @@ class DQN(OffPolicy, stable_baselines3.DQN):
         "q_net": ("forward", "extract_features"),
         "q_net_target": ("forward", "extract_features"),
     }
-    follows = False
-
-    def _optimizers(self) -> list[th.optim.Optimizer]:
-        return [self.policy.optimizer]
 
     def _record(self, program: Program, source: str) -> None:
         batch = self._record_transitions(program, source, self.q_net.features_dim, 1)
@@ -39,14 +34,3 @@ class DQN(OffPolicy, stable_baselines3.DQN):
         loss = (q - target_q.detach()).huber().mean()
         program.log("loss", loss)
         program.minimise(loss, self.policy.optimizer, clip=program.scalar("max_grad_norm"))
-
-    def _train_fused(self, gradient_steps: int, batch_size: int = 100) -> None:
-        source = self._start_round()
-        losses = []
-        for _ in range(gradient_steps):
-            machine, _ = self._next_batch(batch_size, source)
-            machine.set({"max_grad_norm": self.max_grad_norm})
-            machine.run()
-            losses.append(machine.number("loss"))
-        self._n_updates += gradient_steps
-        self._log_round({"loss": losses})

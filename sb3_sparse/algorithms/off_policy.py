@@ -54,7 +54,7 @@ class OffPolicy(Fused, OffPolicyAlgorithm):
     def _record(self, program: Program, source: str) -> None:
         """Record one gradient step."""
 
-    def _details(self) -> tuple[Hashable, ...]:
+    def _depends_on(self) -> tuple[Hashable, ...]:
         """Settings that a recorded gradient step depends on and that may change."""
         return ()
 
@@ -79,7 +79,7 @@ class OffPolicy(Fused, OffPolicyAlgorithm):
         """Return the machine for a batch size, a source and details of the algorithm."""
         optimizers = self._optimizers(*details)
         build = partial(self._record, source=source)
-        return self._trains().machine((source, *self._details()), batch, optimizers, build)
+        return self._trains().machine((source, *self._depends_on()), batch, optimizers, build)
 
     def _find_source(self) -> str:
         """Choose how to read the replay buffer."""

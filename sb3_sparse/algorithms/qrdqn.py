@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Hashable
 
-import torch as th
 from gymnasium import spaces
 
-from sb3_sparse.algorithms.off_policy import OffPolicy
+from sb3_sparse.algorithms.q_learning import QLearning
 from sb3_sparse.fused.parts import parts
 from sb3_sparse.fused.program import Program
 from sb3_sparse.policies.contrib import QRDQN as StockQRDQN
 
 
-class QRDQN(OffPolicy, StockQRDQN):
+class QRDQN(QLearning, StockQRDQN):
     """sb3-contrib's QR-DQN with fused gradient steps, if the policy is sparse.
 
     Example::
@@ -29,12 +28,8 @@ class QRDQN(OffPolicy, StockQRDQN):
         "quantile_net": ("forward", "extract_features"),
         "quantile_net_target": ("forward", "extract_features"),
     }
-    follows = False
 
-    def _optimizers(self) -> list[th.optim.Optimizer]:
-        return [self.policy.optimizer]
-
-    def _details(self) -> tuple[Hashable, ...]:
+    def _depends_on(self) -> tuple[Hashable, ...]:
         return (self.max_grad_norm is None,)
 
     def _record(self, program: Program, source: str) -> None:
@@ -51,15 +46,3 @@ class QRDQN(OffPolicy, StockQRDQN):
         program.log("loss", loss)
         clip = None if self.max_grad_norm is None else program.scalar("max_grad_norm")
         program.minimise(loss, self.policy.optimizer, clip=clip)
-
-    def _train_fused(self, gradient_steps: int, batch_size: int = 100) -> None:
-        source = self._start_round()
-        losses = []
-        for _ in range(gradient_steps):
-            machine, _ = self._next_batch(batch_size, source)
-            if self.max_grad_norm is not None:
-                machine.set({"max_grad_norm": self.max_grad_norm})
-            machine.run()
-            losses.append(machine.number("loss"))
-        self._n_updates += gradient_steps
-        self._log_round({"loss": losses})

@@ -1,4 +1,4 @@
-"""What SAC and TQC have in common: a random actor, and a weight of its entropy that is learned."""
+"""What SAC and TQC have in common: a stochastic actor, and a learned weight of its entropy."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ from sb3_sparse.fused.values import Value
 class SoftActorCritic(OffPolicy):
     """Base class of algorithms with SAC's actor and entropy coefficient.
 
-    Subclasses say what their critics estimate, and inherit an algorithm with these attributes.
+    Subclasses say what their critics estimate, and also inherit the algorithm, which has these
+    attributes.
     """
 
     actor: Any
@@ -32,6 +33,7 @@ class SoftActorCritic(OffPolicy):
     ent_coef_tensor: th.Tensor
     target_entropy: Any
     target_update_interval: int
+
     methods = {
         "actor": ("action_log_prob", "get_action_dist_params", "extract_features"),
         "critic": ("forward", "extract_features"),
@@ -68,8 +70,7 @@ class SoftActorCritic(OffPolicy):
         """
 
     def _record(self, program: Program, source: str) -> None:
-        actor = self.actor
-        critic, target = self.critic, self.critic_target
+        actor, critic = self.actor, self.critic
         dim = int(np.prod(self.action_space.shape or ()))
         batch = self._record_transitions(program, source, actor.features_dim, dim)
 
@@ -111,7 +112,7 @@ class SoftActorCritic(OffPolicy):
         program.log("actor_loss", actor_loss)
         program.minimise(actor_loss, actor.optimizer)
         program.mark("target update")
-        for one, two in zip(critic.q_networks, target.q_networks, strict=True):
+        for one, two in zip(critic.q_networks, self.critic_target.q_networks, strict=True):
             program.polyak_update(parts(one), parts(two), program.scalar("tau"))
 
     def _train_fused(self, gradient_steps: int, batch_size: int = 64) -> None:

@@ -24,7 +24,7 @@ class TQC(SoftActorCritic, StockTQC):
         model.learn(200, callback=SparsityCallback("rigl", update_interval=10))
     """
 
-    def _details(self) -> tuple[Hashable, ...]:
+    def _depends_on(self) -> tuple[Hashable, ...]:
         return (self.top_quantiles_to_drop_per_net,)
 
     def _next_values(self, program: Program, x: Value) -> Value:

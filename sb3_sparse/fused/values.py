@@ -246,13 +246,17 @@ class Value:
         return made
 
     def argmax_features(self) -> Value:
-        """Find the number of the largest feature, the first of equal ones."""
+        """Find the number of the largest feature, the first of equal ones; it has no gradient."""
         made = Value(self.program, 1, self.batched)
         self.program.record("ARGMAX", made, self, first=self.features)
         return made
 
     def sum_blocks(self, size: int) -> Value:
-        """Sum consecutive blocks of ``size`` features, without a gradient."""
+        """Sum consecutive blocks of ``size`` features, without a gradient.
+
+        :raises ValueError: if the features cannot be divided into such blocks
+        """
+        self._check_blocks(size)
         made = Value(self.program, size, self.batched)
         self.program.record("SUM_FEATURES", made, self, first=self.features)
         return made
@@ -267,8 +271,10 @@ class Value:
         """Select the feature with number ``index``.
 
         :param size: select one in each block of this many features; None: all are one block
+        :raises ValueError: if the features cannot be divided into such blocks
         """
         size = self.features if size is None else size
+        self._check_blocks(size)
         made = Value(self.program, self.features // size, self.batched)
 
         def back(g: Value) -> Value:
@@ -280,11 +286,15 @@ class Value:
         self.program.record("PICK", made, self, index, first=size)
         return made
 
+    def _check_blocks(self, size: int) -> None:
+        if size < 1 or self.features % size:
+            raise ValueError(f"{self.features} features cannot be divided into blocks of {size}")
+
     def quantile_huber(self, targets: Value) -> Value:
         """Compute the quantile Huber loss of each feature, summed over ``targets``.
 
-        The features are estimates of evenly spaced quantiles of what the targets are samples of.
-        The targets get no gradient.
+        The features estimate evenly spaced quantiles of the distribution from which the targets are
+        samples. The targets get no gradient.
 
         Source: arXiv:1710.10044, equation 10.
         """

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Iterable
 from functools import cache
 from importlib import import_module
 from typing import Any
@@ -25,14 +24,13 @@ def import_path(path: str) -> Any:
         raise ImportError(str(error)) from error
 
 
-def import_classes(kwargs: dict[str, Any], names: Iterable[str] = CLASSES) -> None:
+def import_classes(kwargs: dict[str, Any]) -> None:
     """Replace dotted paths of classes (``"torch.nn.Tanh"``) by the classes, in place.
 
-    :param kwargs: arguments of SB3, by default of its policies
-    :param names: the arguments that are classes
+    :param kwargs: SB3's policy arguments
     :raises ConfigError: if there is no such class
     """
-    for argument in names:
+    for argument in CLASSES:
         path = kwargs.get(argument)
         if not isinstance(path, str):
             continue

@@ -31,7 +31,7 @@ from sb3_sparse.policies.simba import SimbaActingModule, SimbaCritic, SimbaPolic
 from sb3_sparse.policies.spec import NetworkSpec, PassCounts
 
 if find_spec("sb3_contrib") is None:
-    raise MissingExtra("a sparse policy of TQC, QRDQN, CrossQ or TRPO", "contrib")
+    raise MissingExtra("TQC, QRDQN, CrossQ or TRPO", "contrib")
 else:
     from sb3_contrib import ARS, TRPO, CrossQ, MaskablePPO, RecurrentPPO
     from sb3_contrib import QRDQN as QRDQN  # for this package's own, too

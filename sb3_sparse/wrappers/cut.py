@@ -11,12 +11,12 @@ from stable_baselines3.common.monitor import Monitor
 
 
 class CutEpisodes(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs):
-    """Reports episodes that a wrapper ends outside of SB3's Monitor, as Monitor reports its own.
+    """Reports episodes that are ended by a wrapper outside SB3's Monitor, as Monitor does its own.
 
-    Monitor stands inside of all wrappers that rl-zoo's ``env_wrapper`` names, so it does not see an
-    end that one of these decides, such as a ``TimeLimit``. SB3's ``evaluate_policy`` counts only
-    ends that Monitor has reported, and would wait for ever. Where Monitor has reported an end, or
-    where the game goes on after the loss of a life, nothing changes.
+    Monitor is inside all wrappers that rl-zoo's ``env_wrapper`` names, so it does not see an end
+    that one of these decides, such as a ``TimeLimit``. SB3's ``evaluate_policy`` counts only ends
+    that Monitor has reported, and would wait forever. Where Monitor's report arrives, or where the
+    game goes on after the loss of a life, nothing changes.
 
     It must be the outermost wrapper of an environment of an SB3 VecEnv, which resets an environment
     before it hands out the ``info`` of an episode's last step.
@@ -27,7 +27,6 @@ class CutEpisodes(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
         from gymnasium.wrappers import TimeLimit
         from sb3_sparse.wrappers import CutEpisodes
         from stable_baselines3.common.env_util import make_vec_env
-        from stable_baselines3.common.monitor import Monitor
 
         def wrapped(env: gym.Env) -> gym.Env:
             return CutEpisodes(TimeLimit(env, 50))
@@ -48,8 +47,12 @@ class CutEpisodes(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """As in Gymnasium."""
         observation, reward, terminated, truncated, info = super().step(action)
-        over = (terminated or truncated) and "episode" not in info
-        self._last = info if over else None
+        self._last = None
+        if (terminated or truncated) and "episode" not in info and self.monitor is not None:
+            if self.monitor.needs_reset:  # a wrapper has dropped Monitor's report
+                info["episode"] = _latest(self.monitor)
+            else:
+                self._last = info
         return observation, reward, terminated, truncated, info
 
     def reset(
@@ -61,25 +64,24 @@ class CutEpisodes(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
         if last is None or monitor is None:
             return super().reset(seed=seed, options=options)
         rewards, reported = monitor.rewards, len(monitor.episode_returns)
+        seconds, given = time.time() - monitor.t_start, dict(monitor.current_reset_info)
         start = super().reset(seed=seed, options=options)
         begun = monitor.rewards is not rewards  # Monitor was reset, too
         if begun and len(monitor.episode_returns) == reported:
-            last["episode"] = _report(monitor, rewards, last)
+            monitor.episode_returns.append(sum(rewards))
+            monitor.episode_lengths.append(len(rewards))
+            monitor.episode_times.append(seconds)
+            more = {key: last[key] for key in monitor.info_keywords} | given
+            last["episode"] = {**_latest(monitor), **more}
+            if monitor.results_writer is not None:
+                monitor.results_writer.write_row(last["episode"])
         return start
 
 
-def _report(monitor: Monitor[Any, Any], rewards: list[float], info: dict[str, Any]) -> Any:
-    """Let Monitor record an episode, and return what it says of one."""
-    seconds = time.time() - monitor.t_start
-    monitor.episode_returns.append(sum(rewards))
-    monitor.episode_lengths.append(len(rewards))
-    monitor.episode_times.append(seconds)
-    episode = {
-        "r": round(sum(rewards), 6),
-        "l": len(rewards),
-        "t": round(seconds, 6),
-        **{key: info[key] for key in monitor.info_keywords},
+def _latest(monitor: Monitor[Any, Any]) -> dict[str, Any]:
+    """What Monitor says of the latest episode that it knows."""
+    return {
+        "r": round(monitor.episode_returns[-1], 6),
+        "l": monitor.episode_lengths[-1],
+        "t": round(monitor.episode_times[-1], 6),
     }
-    if monitor.results_writer is not None:
-        monitor.results_writer.write_row(episode)
-    return episode

@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 import traceback
 from collections.abc import Iterator
+from typing import Any
 
+import numpy as np
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 
@@ -17,6 +19,7 @@ CURE = (
     "one, and check that the environment's observations and rewards are finite"
 )
 SHOWN = 3
+OF_ACTIONS = "stable_baselines3.common.distributions"
 
 
 def check_networks(model: BaseAlgorithm) -> None:
@@ -40,17 +43,18 @@ def check_networks(model: BaseAlgorithm) -> None:
 def check_actions(model: BaseAlgorithm, error: Exception) -> None:
     """Raise if an error is torch's refusal to make a distribution of what the policy computes.
 
-    Weights may be finite and yet too large, e.g. a logarithm of -1e30 for a standard deviation.
+    Weights may be finite and yet too large, e.g. a logarithm of -1e30 for a standard deviation. An
+    observation that is not finite has the same effect, but is the environment's.
 
     :raises Diverged: naming the step and what to do
     """
-    last = None
-    for frame, _ in traceback.walk_tb(error.__traceback__):
-        last = frame.f_globals.get("__name__", "")
-    if isinstance(error, ValueError) and str(last).startswith("torch.distributions."):
+    frames = traceback.walk_tb(error.__traceback__)
+    modules = [str(frame.f_globals.get("__name__")) for frame, _ in frames]
+    refused = isinstance(error, ValueError) and modules[-1].startswith("torch.distributions.")
+    if refused and OF_ACTIONS in modules and _is_finite(model._last_obs):
         raise Diverged(
-            f"training diverged: at step {model.num_timesteps} the policy's actions have no "
-            f"distribution, though all networks are finite; {CURE}"
+            f"training diverged: at step {model.num_timesteps} the policy's outputs define no "
+            f"distribution of actions, though all networks are finite; {CURE}"
         )
 
 
@@ -65,6 +69,11 @@ def check_return(mean_return: float, step: int) -> None:
             f"training diverged: the evaluation at step {step} has the return {mean_return}, "
             f"though all networks are finite; {CURE}"
         )
+
+
+def _is_finite(observations: Any) -> bool:
+    parts = observations.values() if isinstance(observations, dict) else [observations]
+    return all(part is None or bool(np.isfinite(part).all()) for part in parts)
 
 
 def _tensors(model: BaseAlgorithm) -> Iterator[tuple[str, th.Tensor]]:

@@ -150,7 +150,7 @@ def test_the_largest_feature_is_the_first_of_equal_ones(numbers):
 
 @pytest.mark.parametrize("batch", [1, 65])
 @pytest.mark.parametrize(("blocks", "size"), [(1, 4), (4, 1), (3, 5)])
-def test_one_feature_of_each_block(blocks, size, batch):
+def test_one_feature_of_each_block(blocks, size, batch, instructions):
     random = th.Generator().manual_seed(blocks)
     x = th.randn(batch, blocks * size, generator=random)
     start = th.randn(blocks * size, generator=random)
@@ -167,6 +167,14 @@ def test_one_feature_of_each_block(blocks, size, batch):
     loss.backward()
     assert ours == pytest.approx(float(loss.detach()), rel=1e-5)
     np.testing.assert_allclose(grad, vector.grad, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("size", [0, 3, 14])
+def test_features_that_are_no_blocks(size):
+    x = Program().input("x", 7)
+    for divide in (x.sum_blocks, lambda size: x.pick(x[0:1], size)):
+        with pytest.raises(ValueError, match=f"7 features cannot be divided into blocks of {size}"):
+            divide(size)
 
 
 @pytest.mark.parametrize("batch", [1, 65, 200])

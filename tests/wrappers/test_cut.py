@@ -115,6 +115,19 @@ def test_a_game_that_ends_between_two_lives_is_not_reported_twice():
     assert envs.envs[0].get_wrapper_attr("monitor").episode_lengths == [3, 3, 3]
 
 
+class Secretive(gym.Wrapper):
+    """Gives no info of what is inside."""
+
+    def step(self, action):
+        return *self.env.step(action)[:4], {}
+
+
+def test_a_report_that_a_wrapper_drops_is_given_again_but_not_recorded_twice():
+    envs = made(lambda env: limited(Secretive(env)), ends=2)
+    assert evaluated(envs, episodes=3)[0] == [3, 3, 3]
+    assert envs.envs[0].get_wrapper_attr("monitor").episode_returns == [3, 3, 3]
+
+
 def test_a_reset_in_mid_episode_reports_nothing():
     env = CutEpisodes(TimeLimit(Monitor(Counting()), 3))
     env.reset()

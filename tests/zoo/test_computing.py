@@ -191,7 +191,7 @@ def test_a_damaged_record_is_named(trained, record, damage):
     [
         (lambda: make(sb3_sparse.SAC), "fused"),
         (lambda: make(sb3_sparse.SAC, use_sde=True), "SB3's own: gSDE"),
-        (lambda: make("TQC"), "SB3's own: TQC has no others"),
+        (lambda: make("CrossQ"), "SB3's own: CrossQ has no others"),
     ],
 )
 def test_how_gradient_steps_run_is_told_before_they_do(make_model, how):

@@ -9,9 +9,11 @@ import signal
 from dataclasses import replace
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from gymnasium.envs.classic_control import PendulumEnv
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import load_results
@@ -337,7 +339,7 @@ def test_networks_that_diverge_after_the_last_evaluation_are_no_finished_run(tmp
     assert RunFolder(tmp_path / "dqn" / "CartPole-v1_1").record()["last_policy"] == 500
 
 
-@pytest.mark.parametrize("n_steps", [64, 128])  # of numbers that are too large, and of NaN
+@pytest.mark.parametrize("n_steps", [64, 128])
 def test_what_sb3_raises_of_networks_that_diverged_is_said_to_be_that(n_steps, tmp_path):
     large = {"learning_rate": 1e30, "n_steps": n_steps}
     run = replace(PPO_RUN, hyperparams={**PPO_RUN.hyperparams, **large})
@@ -348,7 +350,7 @@ def test_what_sb3_raises_of_networks_that_diverged_is_said_to_be_that(n_steps, t
     assert (record["status"], record["last_policy"]) == ("diverged", None)
 
 
-def test_an_error_of_the_environment_is_none_of_the_networks(tmp_path):
+def test_an_error_of_a_callback_is_none_of_the_networks(tmp_path):
     class Refuse(BaseCallback):
         def _on_step(self) -> bool:
             raise ValueError("Expected parameter scale")
@@ -358,11 +360,32 @@ def test_an_error_of_the_environment_is_none_of_the_networks(tmp_path):
     assert not isinstance(caught.value, Diverged)
 
 
+class Broken(PendulumEnv):
+    """Observes NaN after a while."""
+
+    def step(self, action):
+        observation, *rest = super().step(action)
+        self.steps = getattr(self, "steps", 0) + 1
+        return observation * (np.nan if self.steps == 70 else 1), *rest
+
+
+gym.register("Broken-v0", Broken, max_episode_steps=200)
+
+
+def test_an_observation_that_is_nan_is_an_error_of_the_environment(tmp_path):
+    hyperparams = {**PPO_RUN.hyperparams, "normalize": False}
+    run = replace(PPO_RUN, env_id="Broken-v0", hyperparams=hyperparams)
+    with pytest.raises(ValueError, match="Expected parameter loc") as caught:
+        train(run, tmp_path)
+    assert not isinstance(caught.value, Diverged)
+    assert RunFolder(tmp_path / "ppo" / "Broken-v0_1").record()["status"] == "failed"
+
+
 def test_actions_without_a_distribution_are_those_of_networks_that_diverged():
     model = PPO("MlpPolicy", "Pendulum-v1")
     with th.no_grad():
         model.policy.log_std.fill_(-1e30)  # finite, but its exponential is 0
-    without = pytest.raises(Diverged, match="at step 0 the policy's actions have no distribution")
+    without = pytest.raises(Diverged, match="at step 0 the policy's outputs define no distribution")
     with without, diverging(model):
         model.predict(np.zeros(3, np.float32))
 
@@ -602,6 +625,7 @@ def test_a_kill_within_an_evaluation_costs_nothing(tmp_path):
     (stopped.folder / "unfinished" / "best_model.zip").write_bytes(b"the first part")
     assert resume(stopped.folder).finished
     assert not (stopped.folder / "unfinished").exists()
+    DQN.load(stopped.folder / "best_model.zip")
 
 
 def test_tensorboard_goes_on_in_the_same_folder(tmp_path):
@@ -640,25 +664,27 @@ def test_a_wrapper_may_end_episodes(tmp_path):
 )
 def test_a_buffer_may_be_a_dotted_path(run, argument, tmp_path):
     ((name, path),) = argument.items()
-    run = replace(run, n_timesteps=100, hyperparams={**run.hyperparams, **argument})
-    model = train(run, tmp_path).model
-    buffer = getattr(model, name.removesuffix("_class"))
+    outcome = train(replace(run, hyperparams={**run.hyperparams, **argument}), tmp_path)
+    buffer = getattr(outcome.model, name.removesuffix("_class"))
     assert f"{type(buffer).__module__}.{type(buffer).__name__}" == path
-    assert (
-        json.loads((tmp_path / run.algo / f"{run.env_id}_1" / "sparsity.json").read_text())[
-            "settings"
-        ][name]
-        == path
-    )
+    assert RunFolder(outcome.folder).record()["settings"][name] == path
 
 
-@pytest.mark.parametrize("path", ["no.such.Buffer", "stable_baselines3.NoBuffer"])
+@pytest.mark.parametrize(
+    ("path", "what"),
+    [
+        ("no.such.Buffer", "cannot be imported"),
+        ("stable_baselines3.NoBuffer", "cannot be imported"),
+        ("Buffer", "cannot be imported"),
+        ("torch.nn.Tanh", "is not a subclass of stable_baselines3.common.buffers.R"),
+    ],
+)
 @pytest.mark.parametrize(
     ("run", "name"), [(DQN_RUN, "replay_buffer_class"), (PPO_RUN, "rollout_buffer_class")]
 )
-def test_a_buffer_that_is_none_is_refused_before_anything(run, name, path, tmp_path):
+def test_a_buffer_that_is_none_is_refused_before_anything(run, name, path, what, tmp_path):
     run = replace(run, hyperparams={**run.hyperparams, name: path})
-    with pytest.raises(ConfigError, match=f"^{name}='{path}' cannot be imported"):
+    with pytest.raises(ConfigError, match=f"^{name}='{path}' {what}"):
         train(run, tmp_path)
     assert not list(tmp_path.iterdir())
 

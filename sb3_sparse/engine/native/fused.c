@@ -177,8 +177,8 @@ static void sort_features(float *x, int64_t features, int64_t numbers) {
 }
 
 /* For each estimate a of a quantile, the loss to all targets b and its derivative: the Huber loss
-   of their distance, weighted by the quantile's share where the target is not below, else by the
-   rest. `first` is the number of estimates, `last` that of targets. */
+   of their distance, weighted by `share` if the target is at or above the estimate, else by
+   1 - share. `first` is the number of estimates, `last` that of targets. */
 static void quantile_huber(const operation_t *o, const where_t *where) {
     const float *a = at(&o->a, where), *b = at(&o->b, where);
     float *to = at(&o->to, where);
@@ -198,7 +198,8 @@ static void quantile_huber(const operation_t *o, const where_t *where) {
     }
 }
 
-/* Over features. An operand of several blocks has `first` features, or `first` in each. */
+/* Over features. The operand of PICK and the result of PUT have blocks of `first` features; all
+   other operands have `first` features. */
 static void over_features(const operation_t *o, const where_t *where) {
     const float *a = at(&o->a, where), *b = at(&o->b, where);
     float *to = at(&o->to, where);
@@ -241,7 +242,7 @@ static void over_features(const operation_t *o, const where_t *where) {
                 to[f * o->to.feature + e] = (int64_t)b[e] == f % o->first ? from[e] : 0;
         }
         break;
-    case SORT: /* the smallest ones, in the order of their size */
+    case SORT: /* in ascending order */
         for (int64_t f = 0; f < o->features; f++)
             memcpy(to + f * TILE, a + f * o->a.feature, numbers * sizeof *to);
         sort_features(to, o->features, numbers);
