@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import threading
 from collections.abc import Callable
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,8 @@ from torch import nn
 from sb3_sparse.engine.sparse import SPARSE_TYPES
 from sb3_sparse.engine.structure import Structure
 
-MOVES = 10000
+MOVES, OUTPUTS = 10000, 20
+"""How often connections move, and outputs are computed, at least."""
 
 
 def largest_while_moving(
@@ -24,7 +26,7 @@ def largest_while_moving(
     threads: int,
     layer: nn.Module | None = None,
 ) -> tuple[list[Any], set[float]]:
-    """The largest outputs for inputs of 1, and what they may be: each mask's own.
+    """The largest of many outputs for inputs of 1, and what they may be: each mask's own.
 
     Every weight is 0.5, so a mask that is read halfway gives another number, and an error of a
     thread stands among the outputs.
@@ -56,7 +58,9 @@ def largest_while_moving(
     for worker in workers:
         worker.start()
     try:
-        for i in range(MOVES):
+        for i in count():
+            if i >= MOVES and len(found) >= OUTPUTS:
+                break
             structure = structures[(i + 1) % 2]
             layer.restructure(structure, th.full((structure.nnz,), 0.5))
     finally:

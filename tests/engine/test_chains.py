@@ -404,7 +404,6 @@ def test_a_batch_goes_through_while_another_thread_moves_connections():
     found, allowed = largest_while_moving(
         (50, 300), (0.5, 0.01), lambda layer: lambda: layer(x), threads=1
     )
-    assert len(found) > 10
     assert set(found) <= allowed
 
 

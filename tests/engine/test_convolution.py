@@ -182,7 +182,6 @@ def test_a_batch_goes_through_while_another_thread_moves_connections():
         threads=1,
         layer=nn.Conv2d(300, 50, 1),
     )
-    assert len(found) > 10
     assert set(found) <= allowed
 
 

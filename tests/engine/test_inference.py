@@ -423,7 +423,6 @@ def test_connections_that_another_thread_moves_are_never_read_halfway():
         return lambda: inference(x)[0]
 
     found, allowed = largest_while_moving((500, 2000), (0.3, 0.001), actor_of, threads=2)
-    assert len(found) > 10
     assert set(found) <= allowed
 
 
