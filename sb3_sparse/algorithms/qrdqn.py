@@ -9,6 +9,7 @@ from gymnasium import spaces
 from sb3_sparse.algorithms.q_learning import QLearning
 from sb3_sparse.fused.parts import parts
 from sb3_sparse.fused.program import Program
+from sb3_sparse.fused.quantiles import argmax, quantile_huber, sum_blocks
 from sb3_sparse.policies.contrib import QRDQN as StockQRDQN
 
 
@@ -38,11 +39,11 @@ class QRDQN(QLearning, StockQRDQN):
         actions = int(self.action_space.n)
         batch = self._record_transitions(program, source, net.features_dim, 1)
         next_quantiles = program.network(parts(target_net.quantile_net), batch.next_obs)
-        greedy = next_quantiles.sum_blocks(actions).argmax_features()
+        greedy = argmax(sum_blocks(next_quantiles, actions))
         next_value = next_quantiles.pick(greedy, actions)
         target = (batch.rewards + batch.not_done * batch.discounts * next_value).detach()
         taken = program.network(parts(net.quantile_net), batch.obs).pick(batch.actions, actions)
-        loss = taken.quantile_huber(target).sum_features().mean() * (1 / target.features)
+        loss = quantile_huber(taken, target).sum_features().mean() * (1 / target.features)
         program.log("loss", loss)
         clip = None if self.max_grad_norm is None else program.scalar("max_grad_norm")
         program.minimise(loss, self.policy.optimizer, clip=clip)

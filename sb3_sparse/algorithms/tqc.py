@@ -8,6 +8,7 @@ from sb3_sparse.algorithms.soft import SoftActorCritic
 from sb3_sparse.fused.errors import NotCovered
 from sb3_sparse.fused.parts import parts
 from sb3_sparse.fused.program import Program
+from sb3_sparse.fused.quantiles import quantile_huber, sort
 from sb3_sparse.fused.values import Value
 from sb3_sparse.policies.contrib import TQC as StockTQC
 
@@ -33,11 +34,11 @@ class TQC(SoftActorCritic, StockTQC):
         if not 1 <= kept <= critic.quantiles_total:
             raise NotCovered(f"a target of {kept} among {critic.quantiles_total} quantiles")
         networks = [program.network(parts(q), x) for q in self.critic_target.q_networks]
-        return program.joined(networks).sort_features()[:kept]
+        return sort(program.joined(networks))[:kept]
 
     def _critic_loss(self, program: Program, x: Value, target: Value) -> Value:
         losses = [
-            program.network(parts(q), x).quantile_huber(target).mean()
+            quantile_huber(program.network(parts(q), x), target).mean()
             for q in self.critic.q_networks
         ]
         return sum(losses[1:], losses[0]) * (1 / (len(losses) * target.features))

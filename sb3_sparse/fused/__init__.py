@@ -15,17 +15,22 @@ from sb3_sparse.fused.distributions import (
 from sb3_sparse.fused.errors import NotCovered
 from sb3_sparse.fused.parts import parts
 from sb3_sparse.fused.program import Program
+from sb3_sparse.fused.quantiles import argmax, quantile_huber, sort, sum_blocks
 from sb3_sparse.fused.values import Value
 
 __all__ = [
     "NotCovered",
     "Program",
     "Value",
+    "argmax",
     "bernoulli",
     "categorical",
     "gaussian",
     "least_of",
     "multi_categorical",
     "parts",
+    "quantile_huber",
+    "sort",
     "squashed_gaussian",
+    "sum_blocks",
 ]

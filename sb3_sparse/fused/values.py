@@ -239,32 +239,19 @@ class Value:
         made.parents = ((self, back),)
         return made
 
+    def blocks_of(self, size: int) -> int:
+        """Return the number of blocks of ``size`` features.
+
+        :raises ValueError: if the features cannot be divided into such blocks
+        """
+        if size < 1 or self.features % size:
+            raise ValueError(f"{self.features} features cannot be divided into blocks of {size}")
+        return self.features // size
+
     def max_features(self) -> Value:
         """Compute the maximum over features, without a gradient."""
         made = Value(self.program, 1, self.batched)
         self.program.record("MAX_FEATURES", made, self, first=self.features)
-        return made
-
-    def argmax_features(self) -> Value:
-        """Find the number of the largest feature, the first of equal ones; it has no gradient."""
-        made = Value(self.program, 1, self.batched)
-        self.program.record("ARGMAX", made, self, first=self.features)
-        return made
-
-    def sum_blocks(self, size: int) -> Value:
-        """Sum consecutive blocks of ``size`` features, without a gradient.
-
-        :raises ValueError: if the features cannot be divided into such blocks
-        """
-        self._check_blocks(size)
-        made = Value(self.program, size, self.batched)
-        self.program.record("SUM_FEATURES", made, self, first=self.features)
-        return made
-
-    def sort_features(self) -> Value:
-        """Sort the features of each entry, the smallest first, without a gradient."""
-        made = Value(self.program, self.features, self.batched)
-        self.program.record("SORT", made, self)
         return made
 
     def pick(self, index: Value, size: int | None = None) -> Value:
@@ -274,8 +261,7 @@ class Value:
         :raises ValueError: if the features cannot be divided into such blocks
         """
         size = self.features if size is None else size
-        self._check_blocks(size)
-        made = Value(self.program, self.features // size, self.batched)
+        made = Value(self.program, self.blocks_of(size), self.batched)
 
         def back(g: Value) -> Value:
             put = Value(self.program, self.features, self.batched)
@@ -284,27 +270,6 @@ class Value:
 
         made.parents = ((self, back),)
         self.program.record("PICK", made, self, index, first=size)
-        return made
-
-    def _check_blocks(self, size: int) -> None:
-        if size < 1 or self.features % size:
-            raise ValueError(f"{self.features} features cannot be divided into blocks of {size}")
-
-    def quantile_huber(self, targets: Value) -> Value:
-        """Compute the quantile Huber loss of each feature, summed over ``targets``.
-
-        The features estimate evenly spaced quantiles of the distribution from which the targets are
-        samples. The targets get no gradient.
-
-        Source: arXiv:1710.10044, equation 10.
-        """
-        count = self.features
-        both = Value(self.program, 2 * count, True)  # losses, then their derivatives
-        self.program.record(
-            "QUANTILE_HUBER", both, self, targets, first=count, last=targets.features
-        )
-        made, slope = both.view(0, count), both.view(count, 2 * count)
-        made.parents = ((self, lambda g: g * slope),)
         return made
 
     def sum(self) -> Value:

@@ -34,7 +34,7 @@ if find_spec("sb3_contrib") is None:
     raise MissingExtra("TQC, QRDQN, CrossQ or TRPO", "contrib")
 else:
     from sb3_contrib import ARS, TRPO, CrossQ, MaskablePPO, RecurrentPPO
-    from sb3_contrib import QRDQN as QRDQN  # for this package's own, too
+    from sb3_contrib import QRDQN as QRDQN  # which sb3_sparse.algorithms import from here
     from sb3_contrib import TQC as TQC
     from sb3_contrib.common.torch_layers import BatchRenorm1d
     from sb3_contrib.crossq.policies import Actor as CrossQActor

@@ -222,14 +222,13 @@ class SavedModel:
         :raises CorruptStateError: if a file that belongs to the model is damaged
         """
         env_id = self.environment
-        settings = dict(self.settings)
+        settings = with_env_wrappers(self.settings, wrappers)
         kwargs = dict(settings.pop("env_kwargs", {}))
         where = ""
         if self.parameters is not None:
             kwargs |= RunFolder(self.parameters.parent).arguments().get("env_kwargs") or {}
             where = f" with the wrappers and arguments in {self.parameters}"
         kwargs |= env_kwargs or {}
-        settings = with_env_wrappers(settings, wrappers)
         failure = f"{env_id} cannot be made{where}"
         with setup_errors(failure, env_id), quiet(), mujoco_warns_once(env_id):
             check_wrappers(settings)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 import torch as th
@@ -17,6 +19,7 @@ from sb3_sparse.fused.machine import Machine
 from sb3_sparse.fused.operations import Operation, in_phases
 from sb3_sparse.fused.parts import parts
 from sb3_sparse.fused.program import Program
+from sb3_sparse.fused.quantiles import argmax, quantile_huber, sort, sum_blocks
 from sb3_sparse.fused.values import Value
 
 FEATURES = 3
@@ -125,7 +128,7 @@ NUMBERS = st.floats(width=32, allow_nan=True, allow_infinity=True)
 def test_features_are_sorted_as_by_torch(numbers):
     x = th.tensor([numbers], dtype=th.float32)
     start = th.zeros(len(numbers))
-    _, grad = gradient_of(lambda _, a, b: (a.sort_features() * b).sum().sum_features(), x, start)
+    _, grad = gradient_of(lambda _, a, b: (sort(a) * b).sum().sum_features(), x, start)
     assert np.array_equal(grad, x.sort().values[0], equal_nan=True)
 
 
@@ -134,7 +137,7 @@ def test_features_are_sorted_as_by_torch(numbers):
 def test_each_entry_is_sorted_by_itself(features, batch, instructions):
     x = th.randn(batch, features, generator=th.Generator().manual_seed(features))
     start = th.zeros(features)
-    _, grad = gradient_of(lambda _, a, b: (a.sort_features() * b).sum().sum_features(), x, start)
+    _, grad = gradient_of(lambda _, a, b: (sort(a) * b).sum().sum_features(), x, start)
     np.testing.assert_allclose(grad, x.sort().values.sum(0), rtol=1e-5, atol=1e-5)
 
 
@@ -142,7 +145,7 @@ def test_each_entry_is_sorted_by_itself(features, batch, instructions):
 @given(st.lists(st.sampled_from([-1.0, 0.0, 2.0, float("inf"), float("nan")]), min_size=1))
 def test_the_largest_feature_is_the_first_of_equal_ones(numbers):
     room = Room(
-        lambda _, a, b: (a.argmax_features() + b[0:1] * 0.0).sum(), 1, th.optim.SGD,
+        lambda _, a, b: (argmax(a) + b[0:1] * 0.0).sum(), 1, th.optim.SGD,
         th.zeros(len(numbers)), lr=0.0,
     )  # fmt: skip
     assert room.step(th.tensor([numbers])) == np.argmax(numbers)  # NaN is the largest
@@ -156,8 +159,7 @@ def test_one_feature_of_each_block(blocks, size, batch, instructions):
     start = th.randn(blocks * size, generator=random)
 
     def build(program, a, b):
-        totals = a.sum_blocks(size)
-        return (a * b).pick(totals.argmax_features(), size).square().mean()
+        return (a * b).pick(argmax(sum_blocks(a, size)), size).square().mean()
 
     ours, grad = gradient_of(build, x, start)
     vector = start.clone().requires_grad_()
@@ -172,7 +174,7 @@ def test_one_feature_of_each_block(blocks, size, batch, instructions):
 @pytest.mark.parametrize("size", [0, 3, 14])
 def test_features_that_are_no_blocks(size):
     x = Program().input("x", 7)
-    for divide in (x.sum_blocks, lambda size: x.pick(x[0:1], size)):
+    for divide in (partial(sum_blocks, x), partial(x.pick, x[0:1])):
         with pytest.raises(ValueError, match=f"7 features cannot be divided into blocks of {size}"):
             divide(size)
 
@@ -185,8 +187,8 @@ def test_the_loss_of_quantiles_is_that_of_sb3_contrib(estimates, targets, batch,
     x, start = (3 * th.randn(*shape, generator=random) for shape in ((batch, size), (size,)))
 
     def build(program, a, b):
-        loss = (a + b)[0:estimates].quantile_huber(a[0:targets]).sum_features()
-        return loss.mean() * (1 / targets)
+        loss = quantile_huber((a + b)[0:estimates], a[0:targets])
+        return loss.sum_features().mean() * (1 / targets)
 
     ours, grad = gradient_of(build, x, start)
     vector = start.double().requires_grad_()
