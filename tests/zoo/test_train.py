@@ -369,10 +369,8 @@ class Broken(PendulumEnv):
         return observation * (np.nan if self.steps == 70 else 1), *rest
 
 
-gym.register("Broken-v0", Broken, max_episode_steps=200)
-
-
 def test_an_observation_that_is_nan_is_an_error_of_the_environment(tmp_path):
+    gym.register("Broken-v0", Broken, max_episode_steps=200)
     hyperparams = {**PPO_RUN.hyperparams, "normalize": False}
     run = replace(PPO_RUN, env_id="Broken-v0", hyperparams=hyperparams)
     with pytest.raises(ValueError, match="Expected parameter loc") as caught:
