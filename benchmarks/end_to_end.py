@@ -1,7 +1,7 @@
 """``learn()`` from end to end: stock SB3, this package, and SBX, which is SB3 in JAX.
 
 This package takes part twice: "ours" is its own algorithms (``from sb3_sparse import SAC``), and
-"plug-in" is stock SB3's algorithms with its policy. CrossQ and TRPO are plug-in only.
+"plug-in" is stock SB3's algorithms with its policy. TRPO is plug-in only.
 
 Each contender has its own process. All share one core and one thread and learn in turn, a few
 seconds per round, after the steps at which learning starts and SBX compiles. Seconds are processor

@@ -42,6 +42,8 @@ CASES = {
     "DQN 512": Case("DQN", 512, 128),
     "TQC 256": Case("TQC", 256, 256),
     "QRDQN 256": Case("QRDQN", 256, 128),
+    "CrossQ 256": Case("CrossQ", 256, 256),
+    "CrossQ 1024": Case("CrossQ", 1024, 256),
     "PPO 64": Case("PPO", 64, 64),
     "SimBa SAC 128": Case("SAC", 128, 256, "SparseSimbaPolicy"),
     "SimBa SAC 256": Case("SAC", 256, 256, "SparseSimbaPolicy"),

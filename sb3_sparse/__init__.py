@@ -24,6 +24,7 @@ from sb3_sparse.policies.registry import (
 
 if TYPE_CHECKING:
     from sb3_sparse.algorithms.a2c import A2C
+    from sb3_sparse.algorithms.crossq import CrossQ
     from sb3_sparse.algorithms.dqn import DQN
     from sb3_sparse.algorithms.ppo import PPO
     from sb3_sparse.algorithms.qrdqn import QRDQN
@@ -73,7 +74,8 @@ __all__ = [
     "supported_algorithms",
 ]
 if find_spec("sb3_contrib"):
-    __all__ += ["QRDQN", "TQC", "SparseCrossQPolicy", "SparseQRDQNPolicy", "SparseTQCPolicy"]
+    __all__ += ["QRDQN", "TQC", "CrossQ"]
+    __all__ += ["SparseCrossQPolicy", "SparseQRDQNPolicy", "SparseTQCPolicy"]
 __getattr__, __dir__ = lazily(
     __name__,
     {

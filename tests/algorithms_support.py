@@ -15,9 +15,9 @@ from stable_baselines3.common.callbacks import BaseCallback
 import sb3_sparse
 import sb3_sparse.algorithms
 
-NAMES = ("SAC", "TD3", "DDPG", "DQN", "PPO", "A2C", "TQC", "QRDQN")
+NAMES = ("SAC", "TD3", "DDPG", "DQN", "PPO", "A2C", "TQC", "QRDQN", "CrossQ")
 assert set(NAMES) == set(sb3_sparse.algorithms.__all__)
-OFF_POLICY = ("SAC", "TD3", "DDPG", "DQN", "TQC", "QRDQN")
+OFF_POLICY = ("SAC", "TD3", "DDPG", "DQN", "TQC", "QRDQN", "CrossQ")
 DISCRETE = ("DQN", "QRDQN")
 QUANTILES = ("TQC", "QRDQN")
 STOCK = SimpleNamespace(**sb3_sparse.supported_algorithms())
@@ -63,6 +63,8 @@ def arguments_of(name: str) -> dict[str, Any]:
     if name == "A2C":
         return dict(n_steps=5)
     common = dict(learning_starts=20, buffer_size=200, batch_size=70)
+    if name == "CrossQ":
+        return dict(common, learning_rate=3e-4, policy_delay=2)
     return dict(common, train_freq=1, target_update_interval=10) if name in DISCRETE else common
 
 
@@ -76,6 +78,10 @@ def make(library: Any, name: str, env: Any = None, **kwargs: Any) -> BaseAlgorit
     policy_kwargs = {"sparsity": 0.7, "net_arch": [24, 16], **kwargs.pop("policy_kwargs", {})}
     if name in QUANTILES:
         policy_kwargs.setdefault("n_quantiles", 6)
+    if name == "CrossQ":
+        # A bias before a BatchRenorm may have gradient 0 but for rounding, of which Adam makes a
+        # whole step with its usual epsilon.
+        policy_kwargs.setdefault("optimizer_kwargs", dict(eps=1e-3))
     policy = kwargs.pop("policy", "SparsePolicy")
     if policy == "MlpPolicy":
         policy_kwargs.pop("sparsity")

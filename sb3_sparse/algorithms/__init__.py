@@ -12,6 +12,7 @@ from sb3_sparse.lazy import lazily
 
 if TYPE_CHECKING:
     from sb3_sparse.algorithms.a2c import A2C
+    from sb3_sparse.algorithms.crossq import CrossQ
     from sb3_sparse.algorithms.dqn import DQN
     from sb3_sparse.algorithms.ppo import PPO
     from sb3_sparse.algorithms.qrdqn import QRDQN
@@ -21,5 +22,5 @@ if TYPE_CHECKING:
 
 __all__ = ["A2C", "DDPG", "DQN", "PPO", "SAC", "TD3"]
 if find_spec("sb3_contrib"):
-    __all__ += ["QRDQN", "TQC"]
+    __all__ += ["QRDQN", "TQC", "CrossQ"]
 __getattr__, __dir__ = lazily(__name__)

@@ -1,4 +1,4 @@
-"""What SAC and TQC have in common: a stochastic actor, and a learned weight of its entropy."""
+"""What SAC, TQC and CrossQ have in common: a stochastic actor, a learned weight of its entropy."""
 
 from __future__ import annotations
 
@@ -17,28 +17,26 @@ from sb3_sparse.fused.parts import parts
 from sb3_sparse.fused.program import Program
 from sb3_sparse.fused.values import Value
 
+LOGGED = ("ent_coef", "actor_loss", "critic_loss", "ent_coef_loss")
+"""Logged values in SB3's order."""
 
-class SoftActorCritic(OffPolicy):
+
+class StochasticActor(OffPolicy):
     """Base class of algorithms with SAC's actor and entropy coefficient.
 
-    Subclasses say what their critics estimate, and also inherit the algorithm, which has these
-    attributes.
+    Subclasses also inherit the algorithm, which has these attributes.
     """
 
     actor: Any
     critic: Any
-    critic_target: Any
     log_ent_coef: th.Tensor | None
     ent_coef_optimizer: Any
     ent_coef_tensor: th.Tensor
     target_entropy: Any
-    target_update_interval: int
 
-    methods = {
-        "actor": ("action_log_prob", "get_action_dist_params", "extract_features"),
-        "critic": ("forward", "extract_features"),
-        "critic_target": ("forward", "extract_features"),
-    }
+    @property
+    def _action_features(self) -> int:
+        return int(np.prod(self.action_space.shape or ()))
 
     def _optimizers(self) -> list[th.optim.Optimizer]:
         optimizers = [self.actor.optimizer, self.critic.optimizer]
@@ -46,6 +44,80 @@ class SoftActorCritic(OffPolicy):
 
     def _others(self) -> list[th.Tensor]:
         return [] if self.log_ent_coef is None else [self.log_ent_coef]
+
+    def _act(
+        self, program: Program, obs: Value, noise: str, trains: bool = False
+    ) -> tuple[Value, Value]:
+        """Record the actor's actions and their log probabilities.
+
+        :param noise: name of the input of standard normal numbers
+        :param trains: whether BatchRenorms of the actor are in training mode
+        """
+        actor, dim = self.actor, self._action_features
+        network = parts(actor.latent_pi)
+        if trains:
+            (latent,) = program.training_network(network, obs)
+        else:
+            latent = program.network(network, obs)
+        mean = program.network(parts(actor.mu), latent)
+        log_std = program.network(parts(actor.log_std), latent)
+        action, log_prob = squashed_gaussian(
+            mean, log_std.clamp(LOG_STD_MIN, LOG_STD_MAX), program.input(noise, dim),
+            actor.action_dist.epsilon,
+        )  # fmt: skip
+        program.check(log_prob, noise)
+        return action, log_prob
+
+    def _record_ent_coef(self, program: Program) -> Value:
+        """Record the present entropy coefficient."""
+        if self.log_ent_coef is None:
+            ent_coef = program.scalar("ent_coef")
+        else:
+            ent_coef = program.parameter(self.log_ent_coef).exp().detach()
+        program.log("ent_coef", ent_coef)
+        return ent_coef
+
+    def _adjust_ent_coef(self, program: Program, log_prob: Value) -> None:
+        """Record the step of the entropy coefficient, if it is learned."""
+        if self.log_ent_coef is None:
+            return
+        apart = (log_prob + program.scalar("target_entropy")).detach()
+        loss = -(program.parameter(self.log_ent_coef) * apart).mean()
+        program.log("ent_coef_loss", loss)
+        program.minimise(loss, self.ent_coef_optimizer)
+
+    def _set_inputs(self, machine: Machine, *noises: str) -> None:
+        """Set the numbers of the next gradient step.
+
+        :param noises: inputs for which to draw standard normal numbers, in this order
+        """
+        shape = (machine.batch, *(self.action_space.shape or ()))
+        machine.inputs.load({noise: th.randn(shape) for noise in noises})
+        machine.set({"target_entropy": float(self.target_entropy)})
+        if self.log_ent_coef is None:
+            machine.set({"ent_coef": float(self.ent_coef_tensor)})
+
+    def _raise_error(self, machine: Machine, data: Any, noise: str) -> None:
+        """Let SB3's distribution raise its error, e.g. for means that are not finite."""
+        obs = self._observations(machine, data, next_ones=noise == "next_noise")
+        with th.no_grad(), th.random.fork_rng(devices=[]):
+            self.actor.action_log_prob(obs)
+
+
+class SoftActorCritic(StochasticActor):
+    """Base class of SAC and TQC, whose critics have targets.
+
+    Subclasses say what their critics estimate.
+    """
+
+    critic_target: Any
+    target_update_interval: int
+
+    methods = {
+        "actor": ("action_log_prob", "get_action_dist_params", "extract_features"),
+        "critic": ("forward", "extract_features"),
+        "critic_target": ("forward", "extract_features"),
+    }
 
     @abstractmethod
     def _next_values(self, program: Program, x: Value) -> Value:
@@ -71,34 +143,12 @@ class SoftActorCritic(OffPolicy):
 
     def _record(self, program: Program, source: str) -> None:
         actor, critic = self.actor, self.critic
-        dim = int(np.prod(self.action_space.shape or ()))
-        batch = self._record_transitions(program, source, actor.features_dim, dim)
+        batch = self._record_transitions(program, source, actor.features_dim, self._action_features)
+        action, log_prob = self._act(program, batch.obs, "noise")
+        ent_coef = self._record_ent_coef(program)
+        self._adjust_ent_coef(program, log_prob)
 
-        def act(obs: Any, noise: str) -> Any:
-            latent = program.network(parts(actor.latent_pi), obs)
-            mean = program.network(parts(actor.mu), latent)
-            log_std = program.network(parts(actor.log_std), latent)
-            action, log_prob = squashed_gaussian(
-                mean, log_std.clamp(LOG_STD_MIN, LOG_STD_MAX), program.input(noise, dim),
-                actor.action_dist.epsilon,
-            )  # fmt: skip
-            program.check(log_prob, noise)
-            return action, log_prob
-
-        action, log_prob = act(batch.obs, "noise")
-        if self.ent_coef_optimizer is not None:
-            assert self.log_ent_coef is not None
-            log_ent_coef = program.parameter(self.log_ent_coef)
-            ent_coef = log_ent_coef.exp().detach()
-            apart = (log_prob + program.scalar("target_entropy")).detach()
-            ent_coef_loss = -(log_ent_coef * apart).mean()
-            program.log("ent_coef_loss", ent_coef_loss)
-            program.minimise(ent_coef_loss, self.ent_coef_optimizer)
-        else:
-            ent_coef = program.scalar("ent_coef")
-        program.log("ent_coef", ent_coef)
-
-        next_action, next_log_prob = act(batch.next_obs, "next_noise")
+        next_action, next_log_prob = self._act(program, batch.next_obs, "next_noise")
         before = program.joined([batch.next_obs, next_action])
         next_value = self._next_values(program, before) - ent_coef * next_log_prob
         target_q = batch.rewards + batch.not_done * batch.discounts * next_value
@@ -117,15 +167,11 @@ class SoftActorCritic(OffPolicy):
 
     def _train_fused(self, gradient_steps: int, batch_size: int = 64) -> None:
         source = self._start_round()
-        names = ("ent_coef", "actor_loss", "critic_loss", "ent_coef_loss")  # in SB3's order
-        logged: dict[str, list[float]] = {name: [] for name in names}
+        logged: dict[str, list[float]] = {name: [] for name in LOGGED}
         for step in range(gradient_steps):
             machine, data = self._next_batch(batch_size, source)
-            shape = (machine.batch, *(self.action_space.shape or ()))
-            machine.inputs.load({"noise": th.randn(shape), "next_noise": th.randn(shape)})
-            machine.set({"target_entropy": float(self.target_entropy), "tau": self.tau})
-            if self.ent_coef_optimizer is None:
-                machine.set({"ent_coef": float(self.ent_coef_tensor)})
+            self._set_inputs(machine, "noise", "next_noise")
+            machine.set({"tau": self.tau})
             last = (
                 None if step % self.target_update_interval == 0 else machine.marks["target update"]
             )
@@ -134,9 +180,3 @@ class SoftActorCritic(OffPolicy):
                 logged[name].append(machine.number(name))
         self._n_updates += gradient_steps
         self._log_round(logged)
-
-    def _raise_error(self, machine: Machine, data: Any, noise: str) -> None:
-        """Let SB3's distribution raise its error, e.g. for means that are not finite."""
-        obs = self._observations(machine, data, next_ones=noise == "next_noise")
-        with th.no_grad(), th.random.fork_rng(devices=[]):
-            self.actor.action_log_prob(obs)

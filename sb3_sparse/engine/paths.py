@@ -13,6 +13,8 @@ from sb3_sparse.engine.residual import Residual
 
 Paths = Sequence[Sequence[nn.Module]]
 """The modules of each network, in the order of computation."""
+NORMS: list[type[nn.Module]] = [nn.LayerNorm]
+"""Types of a layer's norm; :mod:`sb3_sparse.policies.contrib` adds its BatchRenorm."""
 OWN = ("torch.nn.", "sb3_sparse.engine.")
 """Modules that define a plain ``Sequential``."""
 
@@ -20,16 +22,16 @@ OWN = ("torch.nn.", "sb3_sparse.engine.")
 class Part(NamedTuple):
     """A linear layer and what surrounds it: ``activation(layer(norm(x))) + shortcut``.
 
-    :param layer: None for a LayerNorm at the end of a path, which has no layer behind it
+    :param layer: None for a norm at the end of a path, which has no layer behind it
     :param activation: None: no activation
-    :param norm: LayerNorm of the layer's input; None: there is none
+    :param norm: norm of the layer's input, of a type in :data:`NORMS`; None: there is none
     :param shortcut: number of the part whose result is added, -1 for the input of the path; None:
         nothing is added
     """
 
     layer: nn.Linear | None
     activation: nn.Module | None = None
-    norm: nn.LayerNorm | None = None
+    norm: nn.Module | None = None
     shortcut: int | None = None
 
 
@@ -75,8 +77,10 @@ def _split(path: Iterable[nn.Module], parts: list[Part]) -> bool:
             assert isinstance(module, nn.Linear)
             norm = parts.pop().norm if behind_norm else None
             parts.append(Part(module, norm=norm))
-        elif type(module) is nn.LayerNorm:
-            if behind_norm or len(module.normalized_shape) != 1:
+        elif type(module) in NORMS:
+            if behind_norm or (
+                isinstance(module, nn.LayerNorm) and len(module.normalized_shape) != 1
+            ):
                 return False
             parts.append(Part(None, norm=module))
         elif type(module) in ACTIVATIONS:

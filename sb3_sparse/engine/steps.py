@@ -48,7 +48,7 @@ def steps_of(paths: Paths) -> tuple[list[Step], list[int]] | None:
         key: tuple[int, ...] = ()
         numbers = [-1]  # of the steps of this path, behind the observations
         for layer, activation, norm, shortcut in parts:
-            if layer is None:
+            if layer is None or not isinstance(norm, nn.LayerNorm | None):
                 return None
             key += (id(layer), id(activation), id(norm), -2 if shortcut is None else shortcut)
             if key not in places:

@@ -79,14 +79,21 @@ class Descent:
     def _record_grads(self, behind: Behind, g: Value) -> None:
         program, layer = self._program, behind.layer
         module = program.layers[layer]
-        if any(s.tensor is module.weight and s.optimizer is self._optimizer for s in program.slots):
-            raise NotCovered("a loss that uses a layer twice")
-        program.slot(module.weight, layer, self._optimizer)
-        if module.bias is not None:
-            program.slot(module.bias, None, self._optimizer)
+        again = layer in self._layers
+        if not again:
+            slots = program.slots
+            if any(s.tensor is module.weight and s.optimizer is self._optimizer for s in slots):
+                raise NotCovered("an optimizer that moves a layer twice")
+            program.slot(module.weight, layer, self._optimizer)
+            if module.bias is not None:
+                program.slot(module.bias, None, self._optimizer)
+            self._layers.append(layer)
+        own = ("gradient", layer, id(self._optimizer))
         for kind in ["LINEAR_GRAD"] + ["LINEAR_DENSE_GRAD"] * self._captured:
-            program.record(kind, None, g, behind.x, number=layer, tiled=True, writes=self._all)
-        self._layers.append(layer)
+            program.record(
+                kind, None, g, behind.x, first=int(again), number=layer, tiled=True,
+                reads=(own,) * again, writes=(own, *self._all),
+            )  # fmt: skip
 
     @property
     def _all(self) -> tuple[Any, ...]:

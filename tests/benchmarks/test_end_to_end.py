@@ -84,7 +84,7 @@ def test_the_table_has_a_line_for_each_sparsity_and_method(end_to_end, capsys, t
     ]
 
 
-@pytest.mark.parametrize("algo", ["ppo", "a2c", "sac", "dqn", "tqc", "qrdqn"])
+@pytest.mark.parametrize("algo", ["ppo", "a2c", "sac", "dqn", "tqc", "qrdqn", "crossq"])
 def test_our_gradient_steps_are_fused_while_they_are_measured(end_to_end, algo):
     import learner
 
@@ -101,8 +101,8 @@ def test_our_gradient_steps_are_fused_while_they_are_measured(end_to_end, algo):
 def test_what_has_no_class_of_ours_is_the_plug_in_alone(end_to_end):
     import learner
 
-    assert learner.algorithm("ours", "CrossQ") is None
-    assert learner.algorithm("plug-in", "CrossQ").__module__.startswith("sb3_contrib.")
+    assert learner.algorithm("ours", "TRPO") is None
+    assert learner.algorithm("plug-in", "TRPO").__module__.startswith("sb3_contrib.")
 
 
 def test_medians_and_ratios_are_taken_round_by_round(end_to_end):

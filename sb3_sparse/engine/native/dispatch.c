@@ -66,7 +66,7 @@ static int runs_here(const kernels_t *kernels) {
 #define EXPORT __attribute__((visibility("default")))
 
 /* Changes with every change of what Python hands over. */
-EXPORT int sb3_sparse_version(void) { return 13; }
+EXPORT int sb3_sparse_version(void) { return 14; }
 
 openmp_t sb3_sparse_openmp;
 

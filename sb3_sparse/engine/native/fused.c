@@ -151,9 +151,10 @@ static void elementwise(const operation_t *o, const where_t *where) {
 static void fill(const operation_t *o, const where_t *where) {
     const float *a = at(&o->a, where);
     float *to = at(&o->to, where);
-    for (int64_t f = 0; f < o->features; f++)
-        for (int64_t e = 0; e < where->vectors * WIDTH; e++)
-            to[f * TILE + e] = e < where->entries ? a[f * o->a.feature] : 0;
+    for (int64_t f = 0; f < o->features; f++, a += o->a.feature, to += TILE) {
+        for (int64_t e = 0; e < where->vectors * WIDTH; e += WIDTH) STORE(to + e, *a + (vec){0});
+        for (int64_t e = where->entries; e < where->vectors * WIDTH; e++) to[e] = 0;
+    }
 }
 
 /* Puts the smaller of two features first, in each lane; a NaN is greater than all. */
@@ -310,14 +311,15 @@ static void linear_back(const operation_t *o, const where_t *where) {
                    gate, to);
 }
 
-/* Gradients of weight and bias from a, that of the layer's result, and b, its input. */
+/* Gradients of weight and bias from a, that of the layer's result, and b, its input. They are added
+   to those that are there already if `first` is not 0. */
 static void linear_grad(const operation_t *o, const where_t *where) {
     const linear_t *layer = where->program->layers + o->number;
     const float *g = at(&o->a, where), *x = at(&o->b, where);
     int64_t own = where->thread * where->program->per_thread;
-    int add = where->tile > where->first_tile;
+    int again = (int)o->first, add = again || where->tile > where->first_tile;
     if (o->kind == LINEAR_DENSE_GRAD) {
-        dense_dots(where->vectors, layer->rows, layer->columns, g, x, layer->dense_grad, where->tile > 0);
+        dense_dots(where->vectors, layer->rows, layer->columns, g, x, layer->dense_grad, again || where->tile > 0);
         return;
     }
     if (layer->row_start)
@@ -367,6 +369,12 @@ static void run_share(void *argument) {
     }
 }
 
+/* Adds what another thread has found, and leaves 0, to which a later operation may add. */
+static void take_over(float *to, float *from, int64_t count) {
+    add_to(to, from, count);
+    memset(from, 0, (size_t)count * sizeof *from);
+}
+
 static void run_phase(const program_t *program, const operation_t *first, const operation_t *last) {
     int64_t tiles = (program->batch + TILE - 1) / TILE;
     phase_t phase = {program, first, last, tiles, 1};
@@ -383,8 +391,8 @@ static void run_phase(const program_t *program, const operation_t *first, const 
         int64_t count = layer->row_start ? layer->row_start[layer->rows] : layer->rows * layer->columns;
         for (int64_t i = 1; i < phase.shares; i++) {
             int64_t own = i * program->per_thread;
-            add_to(layer->weight_grad, layer->weight_grad + own, count);
-            if (layer->bias) add_to(layer->bias_grad, layer->bias_grad + own, layer->rows);
+            take_over(layer->weight_grad, layer->weight_grad + own, count);
+            if (layer->bias) take_over(layer->bias_grad, layer->bias_grad + own, layer->rows);
         }
     }
 }
@@ -404,6 +412,45 @@ static void sum_batch(const program_t *program, const operation_t *o) {
         }
         set_lanes(o->to.base + f * TILE, (float)sum);
     }
+}
+
+/* A feature's sum over the batch of x - offset, or of x times y if there is one. */
+static double sum_of(const program_t *program, const place_t *x, const place_t *y, int64_t f, float offset) {
+    const float *a = x->base + f * x->feature, *b = y ? y->base + f * y->feature : 0;
+    double sum = 0;
+    vec part = {0}, more = {0};
+    int64_t left = program->batch;
+    for (int64_t tile = 0; left > 0; tile++, left -= TILE, a += x->tile, b += y ? y->tile : 0) {
+        int64_t entries = left < TILE ? left : TILE, e = 0;
+        for (; e + 2 * WIDTH <= entries; e += 2 * WIDTH) {
+            part += b ? LOAD(a + e) * LOAD(b + e) : LOAD(a + e) - offset;
+            more += b ? LOAD(a + e + WIDTH) * LOAD(b + e + WIDTH) : LOAD(a + e + WIDTH) - offset;
+        }
+        for (; e < entries; e++) sum += b ? a[e] * b[e] : a[e] - offset;
+        if (tile % 8 == 7 || left <= TILE) { /* in parts, so that small terms are not lost */
+            sum += total(part + more);
+            part = more = (vec){0};
+        }
+    }
+    return sum;
+}
+
+/* Each feature's mean over the batch of a, and of b too if there is one: that of equal numbers is
+   exactly their value. */
+static void mean_batch(const program_t *program, const operation_t *o) {
+    double count = (double)program->batch * (o->b.base ? 2 : 1);
+    for (int64_t f = 0; f < o->features; f++) {
+        float first = o->a.base[f * o->a.feature];
+        double sum = sum_of(program, &o->a, 0, f, first);
+        if (o->b.base) sum += sum_of(program, &o->b, 0, f, first);
+        set_lanes(o->to.base + f * TILE, (float)(first + sum / count));
+    }
+}
+
+/* Each feature's sum over the batch of a times b. */
+static void dot_batch(const program_t *program, const operation_t *o) {
+    for (int64_t f = 0; f < o->features; f++)
+        set_lanes(o->to.base + f * TILE, (float)sum_of(program, &o->a, &o->b, f, 0));
 }
 
 static int has_nan(const program_t *program, const operation_t *o) {
@@ -542,12 +589,17 @@ static int run_once(const program_t *program, const operation_t *o) {
     const parameter_t *p = program->parameters + o->number;
     switch (o->kind) {
     case SUM_BATCH: sum_batch(program, o); break;
+    case MEAN_BATCH: mean_batch(program, o); break;
+    case DOT_BATCH: dot_batch(program, o); break;
     case CHECK: return has_nan(program, o);
     case SPREAD:
         for (int64_t f = 0; f < o->features; f++) set_lanes(o->to.base + f * TILE, p->number[f]);
         break;
     case EXPORT:
         for (int64_t f = 0; f < o->features; f++) p->grad[f] = o->a.base[f * o->a.feature];
+        break;
+    case STORE:
+        for (int64_t f = 0; f < o->features; f++) p->number[f] = o->a.base[f * o->a.feature];
         break;
     case PACK:
         if (p->packed) pack(p);

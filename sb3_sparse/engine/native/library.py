@@ -13,7 +13,7 @@ import torch as th
 from sb3_sparse.errors import ConfigError, MissingKernels
 
 PATH = Path(__file__).with_name("kernels.so")
-VERSION = 13
+VERSION = 14
 """Version of the interface; ``dispatch.c`` has the same number."""
 
 

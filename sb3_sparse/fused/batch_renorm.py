@@ -1,0 +1,170 @@
+"""BatchRenorm, which normalises each feature over the batch."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import torch as th
+from torch import nn
+
+from sb3_sparse.fused.errors import NotCovered
+from sb3_sparse.fused.values import Back, Value
+
+Statistics = list[tuple[th.Tensor, Value]]
+"""Running statistics of a norm, each with its next value."""
+
+
+def is_warm(norm: Any) -> bool:
+    """Whether a BatchRenorm is behind its warm-up, and normalises by its running statistics too."""
+    return bool(norm.steps > norm.warmup_steps)
+
+
+def settings_of_renorm(norm: Any) -> tuple[Any, ...]:
+    """Return what a recorded BatchRenorm depends on besides its tensors."""
+    bounds = norm.rmax, norm.dmax
+    return is_warm(norm), norm.eps, norm.momentum, norm.affine, *bounds
+
+
+def by_running_statistics(norm: nn.Module, x: Value) -> Value:
+    """Normalise as BatchRenorm does outside of training.
+
+    :param norm: sb3-contrib's ``BatchRenorm1d``
+    :param x: ``[batch, features]``
+    """
+    settings: Any = norm
+    scale, bias, mean, variance = _tensors(settings, x)
+    return _scaled(_centred(x, mean), scale / (variance + settings.eps).sqrt(), bias)
+
+
+def renormalised(norm: nn.Module, batches: list[Value]) -> tuple[list[Value], Statistics]:
+    """Normalise as BatchRenorm does in training, on the entries of one batch or two.
+
+    Features that are the same in all entries get no gradient after the warm-up, where that of
+    sb3-contrib is NaN.
+
+    :param norm: sb3-contrib's ``BatchRenorm1d``
+    :param batches: each ``[batch, features]``
+    :return: each batch normalised, and the norm's next running statistics
+
+    Source: arXiv:1702.03275.
+    """
+    program: Any = batches[0].program
+    settings: Any = norm
+    scale, bias, running_mean, running_variance = _tensors(settings, batches[0])
+    warm = is_warm(norm)
+    constant: list[Value] = []
+    if warm:
+        batches = [_unless(constant, x) for x in batches]
+    mean = _mean(batches)
+    centred = [_centred(x, mean) for x in batches]
+    others = program.scalar("batch - 1")
+    if len(batches) > 1:
+        others = (others + 1.0) * float(len(batches)) - 1.0
+    variance = _squares(centred) / others
+    deviation = (variance + settings.eps).sqrt()
+    if warm:
+        constant.append(variance.same(0.0))
+        running = (running_variance + settings.eps).sqrt()
+        ratio = (deviation / running).detach().clamp(1 / settings.rmax, settings.rmax)
+        shift = ((mean - running_mean) / running).detach().clamp(-settings.dmax, settings.dmax)
+        factor = scale / (variance / ratio.square() + settings.eps).sqrt()
+        bias = shift * _root(variance) / ratio * factor + bias
+    else:
+        factor = scale / deviation
+    moved = [
+        (settings.ra_mean, running_mean + (mean - running_mean) * settings.momentum),
+        (settings.ra_var, running_variance + (variance - running_variance) * settings.momentum),
+    ]
+    return [_scaled(x, factor, bias) for x in centred], moved
+
+
+def _tensors(norm: Any, x: Value) -> tuple[Value, Value, Value, Value]:
+    """Return scale, bias, and running mean and variance of a norm.
+
+    :raises NotCovered: if it does not fit its input, or has no scale and bias
+    """
+    if norm.num_features != x.features:
+        raise NotCovered(f"a BatchRenorm of {norm.num_features} features gets {x.features}")
+    if not norm.affine:
+        raise NotCovered("a BatchRenorm that is not affine")
+    program: Any = x.program
+    tensors = norm.scale, norm.bias, norm.ra_mean, norm.ra_var
+    scale, bias, mean, variance = map(program.parameter, tensors)
+    return scale, bias, mean, variance
+
+
+# Functions whose gradients are sums over the batch, which these operations compute quickly
+
+
+def _filled(g: Value) -> Value:
+    """Repeat numbers for each entry of the batch; 0 beyond its end."""
+    made = Value(g.program, g.features, True)
+    g.program.record("FILL", made, g)
+    return made
+
+
+def _mean(batches: list[Value]) -> Value:
+    program, features = batches[0].program, batches[0].features
+    made = Value(program, features, False)
+
+    share = _once(lambda g: _filled(g * (program.scalar("1 / batch") * (1.0 / len(batches)))))
+    made.parents = tuple((x, share) for x in batches)
+    program.record("MEAN_BATCH", made, *batches, tiled=False)
+    return made
+
+
+def _squares(batches: list[Value]) -> Value:
+    """Sum the squares of all entries."""
+    sums = [_dot(x, x) for x in batches]
+    made = sum(sums[1:], sums[0]).detach()
+    twice = _once(lambda g: _filled(g * 2.0))
+    made.parents = tuple((x, partial(_times, x, twice)) for x in batches)
+    return made
+
+
+def _times(x: Value, of_gradient: Back, g: Value) -> Value:
+    return x * of_gradient(g)
+
+
+def _once(make: Back) -> Back:
+    """Share what is made of a gradient among several parents."""
+    made: dict[Value, Value] = {}
+    return lambda g: made[g] if g in made else made.setdefault(g, make(g))
+
+
+def _dot(x: Value, y: Value) -> Value:
+    """Sum the products of two batches over the batch, without a gradient."""
+    made = Value(x.program, x.features, False)
+    x.program.record("DOT_BATCH", made, x, y, tiled=False)
+    return made
+
+
+def _total(g: Value) -> Value:
+    return _dot(g, g.program.constant(1.0))
+
+
+def _centred(x: Value, mean: Value) -> Value:
+    made = Value(x.program, x.features, True, ((x, lambda g: g), (mean, lambda g: -_total(g))))
+    x.program.record("SUBTRACT", made, x, mean)
+    return made
+
+
+def _scaled(x: Value, factor: Value, shift: Value) -> Value:
+    made = x.detach() * factor + shift
+    made.parents = ((x, lambda g: g * factor), (factor, lambda g: _dot(g, x)), (shift, _total))
+    return made
+
+
+def _root(x: Value) -> Value:
+    """Compute the square root; 0 has the gradient 0."""
+    made = x.sqrt()
+    made.parents = ((x, lambda g: g * 0.5 / (made + made.same(0.0))),)
+    return made
+
+
+def _unless(constant: list[Value], x: Value) -> Value:
+    """Pass on the gradient of the features that are not constant, which is known later."""
+    made = x.detach()
+    made.parents = ((x, lambda g: g * (1.0 - constant[0])),)
+    return made
