@@ -28,6 +28,7 @@ from sb3_sparse.engine.layer import TRIES
 from sb3_sparse.engine.linear import SparseLinear
 from sb3_sparse.engine.masked import MaskedStorage
 from sb3_sparse.engine.native.library import bits_of, library, readable, why_missing
+from sb3_sparse.engine.norms import is_ready, settings_of_norm
 from sb3_sparse.engine.paths import Paths, modules_of
 from sb3_sparse.engine.steps import Step, steps_of, tensors_of
 from sb3_sparse.engine.structure import Structure
@@ -72,8 +73,9 @@ class Inference:
         self._total = sum(self._widths)
         self._layers = [step.layer for step in steps]
         self._sparse = [layer for layer in self._layers if isinstance(layer, SparseLinear)]
-        around = [module for step in steps for module in (step.activation, step.norm)]
-        self._adjustable = [m for m in around if isinstance(m, ADJUSTABLE)]
+        activations = [step.activation for step in steps]
+        self._adjustable = [m for m in activations if isinstance(m, ADJUSTABLE)]
+        self._norms = [step.norm for step in steps if step.norm is not None]
         self._targets = [layer for layer in self._sparse if layer.is_target]
         hooks = ((vars(m)["_forward_hooks"], vars(m)["_forward_pre_hooks"]) for m in modules)
         self._hooks = list(chain.from_iterable(hooks))
@@ -176,7 +178,7 @@ class Inference:
         tensors = [tensor.data_ptr() for tensor in self._tensors]
         sizes = list(map(th.Tensor.size, self._tensors))
         structures = [layer.structure for layer in self._sparse]
-        settings = list(map(settings_of, self._adjustable))
+        settings = self._settings()
         binding = self._binding
         if (
             binding is not None
@@ -189,6 +191,9 @@ class Inference:
             return binding
         self._binding = binding = self._bind()
         return binding
+
+    def _settings(self) -> list[tuple[Any, ...]]:
+        return [*map(settings_of, self._adjustable), *map(settings_of_norm, self._norms)]
 
     def _bind(self) -> Binding | None:
         """Hold the present tensors for as long as the kernels may read them.
@@ -210,7 +215,7 @@ class Inference:
             [tensor.data_ptr() for tensor in held],
             [tensor.size() for tensor in held],
             structures,
-            list(map(settings_of, self._adjustable)),
+            self._settings(),
             arguments,
             held,
         )
@@ -221,11 +226,13 @@ class Inference:
         :param structures: connections of the sparse layers
         :param held: the layers' tensors, in order
         """
+        if not all(map(is_ready, self._norms)):
+            return None
         fields: list[int] = []
         for number, step in enumerate(self._steps):
             layer = step.layer
             shape = layer.out_features, layer.in_features
-            sizes: list[tuple[int, ...]] = [shape, shape[:1], shape, shape[1:], shape[1:]]
+            sizes: list[tuple[int, ...]] = [shape, shape[:1], shape, *[shape[1:]] * 4]
             start = column = 0
             if isinstance(layer, SparseLinear):
                 structure = next(structures)
@@ -242,14 +249,14 @@ class Inference:
                         return None
                     place = now.data_ptr()
                 places.append(place)
-            weight, bias, mask, scale, shift = places
+            weight, bias, mask, *of_norm = places
             kind, a, b = number_of(step.activation)
             out = -1
             if number in self._ends:
                 out = self._places[self._ends.index(number)]
             fields += (*shape, start, column, weight, mask, bias)
             fields += (kind, bits_of(a), bits_of(b), step.source, out)
-            epsilon = -1.0 if step.norm is None else step.norm.eps
-            fields += (bits_of(epsilon), scale, shift)
+            epsilon = -1.0 if step.norm is None else settings_of_norm(step.norm)[0]
+            fields += (bits_of(epsilon), *of_norm)
             fields.append(-2 if step.shortcut is None else step.shortcut)
         return (ctypes.c_int64 * len(fields))(*fields)

@@ -9,12 +9,11 @@ from torch import nn
 
 from sb3_sparse.engine.activations import ACTIVATIONS
 from sb3_sparse.engine.linear import SparseLinear
+from sb3_sparse.engine.norms import NORMS, features_of
 from sb3_sparse.engine.residual import Residual
 
 Paths = Sequence[Sequence[nn.Module]]
 """The modules of each network, in the order of computation."""
-NORMS: list[type[nn.Module]] = [nn.LayerNorm]
-"""Types of a layer's norm; :mod:`sb3_sparse.policies.contrib` adds its BatchRenorm."""
 OWN = ("torch.nn.", "sb3_sparse.engine.")
 """Modules that define a plain ``Sequential``."""
 
@@ -24,7 +23,7 @@ class Part(NamedTuple):
 
     :param layer: None for a norm at the end of a path, which has no layer behind it
     :param activation: None: no activation
-    :param norm: norm of the layer's input, of a type in :data:`NORMS`; None: there is none
+    :param norm: norm of the layer's input, of a type in ``NORMS``; None: there is none
     :param shortcut: number of the part whose result is added, -1 for the input of the path; None:
         nothing is added
     """
@@ -78,9 +77,7 @@ def _split(path: Iterable[nn.Module], parts: list[Part]) -> bool:
             norm = parts.pop().norm if behind_norm else None
             parts.append(Part(module, norm=norm))
         elif type(module) in NORMS:
-            if behind_norm or (
-                isinstance(module, nn.LayerNorm) and len(module.normalized_shape) != 1
-            ):
+            if behind_norm or len(features_of(module)) != 1:
                 return False
             parts.append(Part(None, norm=module))
         elif type(module) in ACTIVATIONS:

@@ -8,6 +8,7 @@ import torch as th
 from torch import nn
 
 from sb3_sparse.engine.masked import FLOAT_MASK_KEY
+from sb3_sparse.engine.norms import features_of, tensors_of_norm
 from sb3_sparse.engine.paths import Paths, parts_of
 
 MOST_STEPS = 64
@@ -19,7 +20,7 @@ class Step(NamedTuple):
 
     :param layer: the layer
     :param activation: None: no activation
-    :param norm: LayerNorm of its input; None: there is none
+    :param norm: norm of its input; None: there is none
     :param source: number of the step that gives its input; -1: the observations
     :param shortcut: number of the step whose result is added, -1: the observations; None: nothing
         is added
@@ -27,7 +28,7 @@ class Step(NamedTuple):
 
     layer: nn.Linear
     activation: nn.Module | None
-    norm: nn.LayerNorm | None
+    norm: nn.Module | None
     source: int
     shortcut: int | None
 
@@ -48,7 +49,7 @@ def steps_of(paths: Paths) -> tuple[list[Step], list[int]] | None:
         key: tuple[int, ...] = ()
         numbers = [-1]  # of the steps of this path, behind the observations
         for layer, activation, norm, shortcut in parts:
-            if layer is None or not isinstance(norm, nn.LayerNorm | None):
+            if layer is None:
                 return None
             key += (id(layer), id(activation), id(norm), -2 if shortcut is None else shortcut)
             if key not in places:
@@ -66,10 +67,10 @@ def steps_of(paths: Paths) -> tuple[list[Step], list[int]] | None:
 
 
 def tensors_of(step: Step) -> tuple[th.Tensor | None, ...]:
-    """Return the weight, bias and mask of a step's layer, and its norm's scale and shift."""
+    """Return the weight, bias and mask of a step's layer, and the tensors of its norm."""
     layer, norm = step.layer, step.norm
-    affine = (None, None) if norm is None else (norm.weight, norm.bias)
-    return layer.weight, layer.bias, layer._buffers.get(FLOAT_MASK_KEY), *affine
+    mask = layer._buffers.get(FLOAT_MASK_KEY)
+    return layer.weight, layer.bias, mask, *tensors_of_norm(norm)
 
 
 def _fits(step: Step, steps: list[Step]) -> bool:
@@ -81,6 +82,6 @@ def _fits(step: Step, steps: list[Step]) -> bool:
 
     return (
         width(step.source, columns) == columns
-        and (step.norm is None or step.norm.normalized_shape == (columns,))
+        and (step.norm is None or features_of(step.norm) == (columns,))
         and (step.shortcut is None or width(step.shortcut, steps[0].layer.in_features) == rows)
     )

@@ -8,7 +8,8 @@ from torch import nn
 
 from sb3_sparse.engine.activations import ACTIVATIONS
 from sb3_sparse.engine.linear import SparseLinear
-from sb3_sparse.engine.paths import NORMS, is_residual, is_sequence, parts_of
+from sb3_sparse.engine.norms import NORMS
+from sb3_sparse.engine.paths import is_residual, is_sequence, parts_of
 from sb3_sparse.fused.errors import NotCovered
 from sb3_sparse.fused.program import Parts
 

@@ -12,7 +12,7 @@ from stable_baselines3.common.type_aliases import Schedule
 from torch import nn
 
 from sb3_sparse.engine.internals import become
-from sb3_sparse.engine.paths import NORMS
+from sb3_sparse.engine.norms import NORMS
 from sb3_sparse.errors import MissingExtra
 from sb3_sparse.policies.actor_critic import SparseActorCriticPolicy
 from sb3_sparse.policies.base import BaseSparsePolicy

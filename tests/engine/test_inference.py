@@ -22,6 +22,7 @@ from sb3_sparse.engine.linear import SparseLinear
 from sb3_sparse.engine.masked import MaskedStorage
 from sb3_sparse.engine.native import library
 from sb3_sparse.engine.structure import Structure
+from sb3_sparse.policies.contrib import SoundBatchRenorm1d
 
 ELEMENTWISE = [
     *(kind for kind in ACTIVATIONS if kind is not nn.GELU),
@@ -119,6 +120,37 @@ def test_every_activation_is_torchs_from_end_to_end_of_its_range(instructions, a
     np.testing.assert_allclose(
         ours[0], activation()(points.double()), rtol=2e-6, atol=4e-7, err_msg=str(activation)
     )
+
+
+def renormalised() -> nn.Sequential:
+    """Norms with running statistics, before the first layer and between two."""
+    th.manual_seed(0)
+    first, second = SoundBatchRenorm1d(5), SoundBatchRenorm1d(7)
+    for norm in (first, second):
+        for tensor in (norm.scale, norm.bias, norm.ra_mean, norm.ra_var):
+            nn.init.uniform_(tensor, 0.1, 2.0)
+    return nn.Sequential(first, nn.Linear(5, 7), nn.ReLU(), second, nn.Linear(7, 2)).eval()
+
+
+@pytest.mark.parametrize("count", [1, 3, 16])
+def test_batch_renorm_uses_its_running_statistics(count, instructions):
+    net, x = renormalised(), th.randn(count, 5)
+    found = Inference.of([[net]])
+    for number in (1.0, 3.0):
+        net[3].ra_mean[2] = number  # in place, as a gradient step moves it
+        (result,) = found(x)
+        close(result, copy.deepcopy(net).double()(x.double()).detach())
+
+
+def test_a_norm_that_learns_statistics_is_called():
+    net, x = renormalised(), th.randn(4, 5)
+    found = Inference.of([[net]])
+    net[3].train()
+    assert found(x) is None
+    net[3].eval()
+    assert found(x) is not None
+    net[0].affine = False
+    assert found(x) is None
 
 
 def test_heads_share_their_trunk(instructions):

@@ -121,7 +121,19 @@ static void several(const step_t *step, int64_t batch, const float *x, float *y)
     }
 }
 
-/* LayerNorm of each of `lanes` inputs, whose features are `lanes` apart. */
+/* A norm by means and variances of its own, of each of `lanes` inputs, whose features are `lanes`
+   apart. */
+static void by_statistics(const step_t *step, int64_t lanes, const float *x, float *y) {
+    for (int64_t k = 0; k < step->columns; k++) {
+        float deviation = sqrtf(step->variance[k] + (float)step->epsilon);
+        for (int64_t e = 0; e < lanes; e++) {
+            float z = (x[k * lanes + e] - step->mean[k]) / deviation;
+            y[k * lanes + e] = step->scale[k] * z + step->shift[k];
+        }
+    }
+}
+
+/* The same by LayerNorm. */
 static void normalise(const step_t *step, int64_t lanes, const float *x, float *y) {
     int64_t n = step->columns;
     for (int64_t e = 0; e < lanes; e++) {
@@ -170,7 +182,7 @@ int NAMED(act, SUFFIX)(const step_t *steps, int64_t count, int64_t batch, int do
         const step_t *step = steps + s;
         const float *from = step->from < 0 ? input : place[step->from];
         if (step->epsilon >= 0) {
-            normalise(step, lanes, from, next);
+            (step->mean ? by_statistics : normalise)(step, lanes, from, next);
             from = next;
             next += padded(step->columns) * lanes;
         }

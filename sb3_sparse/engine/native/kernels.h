@@ -82,9 +82,10 @@ typedef struct {
     double a, b;
     int64_t from; /* number of the step whose result is the input; -1: the observations */
     int64_t out;  /* feature of `y` at which the result [batch, rows] begins; -1: nobody reads it */
-    double epsilon;     /* of the LayerNorm of the input; negative: there is none */
-    const float *scale; /* [columns] of the LayerNorm, or NULL */
+    double epsilon;     /* of the norm of the input; negative: there is none */
+    const float *scale; /* [columns] of the norm, or NULL */
     const float *shift; /* [columns], or NULL */
+    const float *mean, *variance; /* [columns] by which it normalises; NULL: it is a LayerNorm */
     int64_t add; /* number of the step whose result is added; -1: the observations; -2: nothing */
 } step_t;
 
