@@ -151,8 +151,9 @@ def _centred(x: Value, mean: Value) -> Value:
 
 
 def _scaled(x: Value, factor: Value, shift: Value) -> Value:
-    made = x.detach() * factor + shift
+    made = Value(x.program, x.features, True)
     made.parents = ((x, lambda g: g * factor), (factor, lambda g: _dot(g, x)), (shift, _total))
+    x.program.record("MULTIPLY_ADD", made, x, factor, shift)
     return made
 
 

@@ -10,7 +10,7 @@ import torch as th
 from torch import nn
 
 from sb3_sparse.engine.activations import number_of
-from sb3_sparse.fused.operations import Operation
+from sb3_sparse.fused.operations import READ_SHARED, Operation
 from sb3_sparse.fused.values import Number, Value
 
 
@@ -90,9 +90,17 @@ class Recording:
         if to is not None:
             features = to.features
             others.setdefault("tiled", to.batched)
+        if others.get("tiled", True) and kind not in READ_SHARED:
+            operands = tuple(x if x.batched else self._repeated(x) for x in operands)
         operation = Operation(kind, to, operands, features, **others)
         self.operations.append(operation)
         return operation
+
+    def _repeated(self, x: Value) -> Value:
+        """Give each entry of the batch its own copy of shared numbers."""
+        made = Value(self, x.features, True)
+        self.record("COPY", made, x)
+        return made
 
     def scalar(self, name: str) -> Value:
         """Declare a number that each run sets."""

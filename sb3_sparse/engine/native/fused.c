@@ -79,16 +79,19 @@ INLINE float *at(const place_t *place, const where_t *where) {
     return place->base + where->thread * place->thread + where->tile * place->tile;
 }
 
+/* Distance of an operand's vectors. What the whole batch shares has one vector. */
+INLINE int64_t step_of(const place_t *place) { return place->thread | place->tile ? WIDTH : 0; }
+
 /* Loops over features and vectors of the operands that a kind has. */
 #define EACH(EXPRESSION)                                                              \
     for (int64_t f = 0; f < o->features; f++)                                         \
         for (int64_t j = 0; j < where->vectors; j++) {                                \
-            vec x = LOAD(a + f * o->a.feature + j * WIDTH);                           \
+            vec x = LOAD(a + f * o->a.feature + j * a_step);                          \
             STORE(to + f * o->to.feature + j * WIDTH, EXPRESSION);                    \
         }                                                                             \
     break;
-#define Y LOAD(b + f * o->b.feature + j * WIDTH)
-#define Z LOAD(c + f * o->c.feature + j * WIDTH)
+#define Y LOAD(b + f * o->b.feature + j * b_step)
+#define Z LOAD(c + f * o->c.feature + j * c_step)
 #define ONE_IF(CONDITION) ((vec)((CONDITION) & (ivec)(1 + (vec){0})))
 
 INLINE vec least(vec x, vec y) { return choose((y < x) | (y != y), y, x); }
@@ -119,12 +122,14 @@ static void slope_op(const operation_t *o, const where_t *where, const float *a,
 
 static void elementwise(const operation_t *o, const where_t *where) {
     const float *a = at(&o->a, where), *b = at(&o->b, where), *c = at(&o->c, where);
+    int64_t a_step = step_of(&o->a), b_step = step_of(&o->b), c_step = step_of(&o->c);
     float *to = at(&o->to, where);
     switch (o->kind) {
     case COPY: EACH(x)
     case ADD: EACH(x + Y)
     case SUBTRACT: EACH(x - Y)
     case MULTIPLY: EACH(x * Y)
+    case MULTIPLY_ADD: EACH(x * Y + Z)
     case DIVIDE: EACH(x / Y)
     case LEAST: EACH(least(x, Y))
     case LESS: EACH(ONE_IF(x < Y))
@@ -398,7 +403,7 @@ static void run_phase(const program_t *program, const operation_t *first, const 
 }
 
 static void set_lanes(float *to, float x) {
-    for (int i = 0; i < TILE; i++) to[i] = x;
+    STORE(to, x + (vec){0});
 }
 
 /* Each feature's sum over the batch. */
@@ -408,7 +413,7 @@ static void sum_batch(const program_t *program, const operation_t *o) {
         for (int64_t n = 0; n < program->batch; n += TILE) {
             const float *a = o->a.base + n / TILE * o->a.tile + f * o->a.feature;
             int64_t entries = program->batch - n < TILE ? program->batch - n : TILE;
-            for (int64_t e = 0; e < entries; e++) sum += a[e];
+            for (int64_t e = 0; e < entries; e++) sum += a[step_of(&o->a) ? e : 0];
         }
         set_lanes(o->to.base + f * TILE, (float)sum);
     }
@@ -417,16 +422,18 @@ static void sum_batch(const program_t *program, const operation_t *o) {
 /* A feature's sum over the batch of x - offset, or of x times y if there is one. */
 static double sum_of(const program_t *program, const place_t *x, const place_t *y, int64_t f, float offset) {
     const float *a = x->base + f * x->feature, *b = y ? y->base + f * y->feature : 0;
+    int64_t each = y && step_of(y); /* whether y differs from entry to entry */
     double sum = 0;
     vec part = {0}, more = {0};
     int64_t left = program->batch;
     for (int64_t tile = 0; left > 0; tile++, left -= TILE, a += x->tile, b += y ? y->tile : 0) {
         int64_t entries = left < TILE ? left : TILE, e = 0;
         for (; e + 2 * WIDTH <= entries; e += 2 * WIDTH) {
-            part += b ? LOAD(a + e) * LOAD(b + e) : LOAD(a + e) - offset;
-            more += b ? LOAD(a + e + WIDTH) * LOAD(b + e + WIDTH) : LOAD(a + e + WIDTH) - offset;
+            part += b ? LOAD(a + e) * LOAD(b + each * e) : LOAD(a + e) - offset;
+            int64_t next = e + WIDTH;
+            more += b ? LOAD(a + next) * LOAD(b + each * next) : LOAD(a + next) - offset;
         }
-        for (; e < entries; e++) sum += b ? a[e] * b[e] : a[e] - offset;
+        for (; e < entries; e++) sum += b ? a[e] * b[each * e] : a[e] - offset;
         if (tile % 8 == 7 || left <= TILE) { /* in parts, so that small terms are not lost */
             sum += total(part + more);
             part = more = (vec){0};
@@ -456,7 +463,8 @@ static void dot_batch(const program_t *program, const operation_t *o) {
 static int has_nan(const program_t *program, const operation_t *o) {
     for (int64_t n = 0; n < program->batch; n++)
         for (int64_t f = 0; f < o->features; f++) {
-            float x = o->a.base[n / TILE * o->a.tile + f * o->a.feature + n % TILE];
+            int64_t lane = step_of(&o->a) ? n % TILE : 0;
+            float x = o->a.base[n / TILE * o->a.tile + f * o->a.feature + lane];
             if (x != x) return 1;
         }
     return 0;
@@ -585,7 +593,7 @@ static void turn(const linear_t *layer) {
 
 /* Whether it found what must not be. */
 static int run_once(const program_t *program, const operation_t *o) {
-    where_t where = {.program = program, .entries = TILE, .vectors = TILE / WIDTH};
+    where_t where = {.program = program, .entries = WIDTH, .vectors = 1};
     const parameter_t *p = program->parameters + o->number;
     switch (o->kind) {
     case SUM_BATCH: sum_batch(program, o); break;

@@ -1,8 +1,8 @@
 /* A gradient step as a program: a list of operations that one call runs.
  *
- * Values lie in tiles (see kernels.h): a batched value has [tiles, features, TILE] numbers, one that is
- * the same for the whole batch has [features, TILE] with all lanes equal, so that every operation
- * reads both in the same way. Operations marked `tiled` that follow each other are a phase: a tile
+ * Values lie in tiles (see kernels.h): a batched value has [tiles, features, TILE] numbers. One that
+ * the whole batch shares has [features, TILE], of which a vector is in use, with all lanes equal;
+ * of what is tiled, elementwise operations and FILL alone read it. Operations marked `tiled` that follow each other are a phase: a tile
  * goes through all of them before the next one begins, and threads share the tiles. All others run
  * once, on one thread, between phases.
  *
@@ -85,11 +85,12 @@ typedef struct {
 /* Kinds of operations. Python has the same list. */
 enum {
     /* elementwise: to = f(a, b, c) */
-    COPY, ADD, SUBTRACT, MULTIPLY, DIVIDE, LEAST, /* b where it is less than a, else a */
+    COPY, ADD, SUBTRACT, MULTIPLY, MULTIPLY_ADD, DIVIDE, LEAST, /* b where it is less than a, else a */
     LESS, SAME, CLAMP, INSIDE,                    /* of a between b and c */
     EXP, LOG, SQRT, ABS, HUBER,                   /* smooth L1 of a */
-    ACTIVATION, SLOPE_RESULT, SLOPE_INPUT,         /* to = a * slope at b */
+    SLOPE_INPUT,                                  /* a * slope at b */
     FILL,                                         /* a, but 0 beyond the batch */
+    ACTIVATION, SLOPE_RESULT,
     /* over features */
     SUM_FEATURES, MAX_FEATURES, PICK, PUT, ARGMAX, SORT, QUANTILE_HUBER,
     /* layers and inputs */
