@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import stable_baselines3
 import torch as th
-from algorithms_support import NAMES as FUSED
+from algorithms_support import NAMES as FUSED_ALGORITHMS
 from algorithms_support import assert_alike, assert_like_stock, learn, moving, policy_kwargs_of
 from algorithms_support import make as make_alike
 from simba_support import simba_by_hand
@@ -29,6 +29,7 @@ NAMES = sorted(
     for name, cls in ALGORITHMS.items()
     if isinstance(cls.policy_aliases.get("SparseSimbaPolicy"), type)
 )
+FUSED = [name for name in FUSED_ALGORITHMS if name in NAMES]
 ON_POLICY = ("PPO", "A2C", "TRPO")
 STORAGES = ["masked", "sparse"]
 
