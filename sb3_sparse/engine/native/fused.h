@@ -1,10 +1,10 @@
 /* A gradient step as a program: a list of operations that one call runs.
  *
- * Values lie in tiles (see kernels.h): a batched value has [tiles, features, TILE] numbers. One that
- * the whole batch shares has [features, TILE], of which a vector is in use, with all lanes equal;
- * of what is tiled, elementwise operations and FILL alone read it. Operations marked `tiled` that follow each other are a phase: a tile
- * goes through all of them before the next one begins, and threads share the tiles. All others run
- * once, on one thread, between phases.
+ * Values lie in tiles (see kernels.h). A batched value has [tiles, features, TILE] numbers. One that
+ * the whole batch shares has [features, TILE], of which the first vector is in use, with all lanes
+ * equal; among tiled operations, only elementwise ones and FILL read it. Operations marked `tiled`
+ * that follow each other are a phase: a tile goes through all of them before the next one begins, and
+ * threads share the tiles. All others run once, on one thread, between phases.
  *
  * All fields are 8 bytes wide; Python fills them in this order.
  */
