@@ -80,12 +80,15 @@ def one_act(lib, random, widths: list[int], batch: int, broken: bool):
         source = number - 1 - (number == len(widths) - 1)
         steps += [int(random.integers(15)), 0, 0, source, total if head else -1]
         norm = random.random() < 0.5
-        affine = [buffer(columns) if norm and random.random() < 0.5 else None for _ in range(2)]
-        kept.append(affine)
+        own = norm and random.random() < 0.5
+        some = [own or (norm and random.random() < 0.5) for _ in range(2)]
+        affine = [buffer(columns) if there else None for there in some]
+        statistics = [buffer(columns) if own else None for _ in range(2)]
+        kept += [affine, statistics]
         epsilon = struct.unpack("q", struct.pack("d", 1e-6 if norm else -1.0))[0]
         alike = [n for n, w in enumerate(widths[: number + 1], -1) if w == rows] if not head else []
         added = int(random.choice(alike)) if alike and random.random() < 0.7 else -2
-        steps += [epsilon, *map(address, affine), added]
+        steps += [epsilon, *map(address, affine + statistics), added]
         total += rows if head else 0
     packed = (ctypes.c_int64 * len(steps))(*steps)
     doubles = int(random.integers(2))

@@ -57,8 +57,11 @@ def test_addresses_are_what_they_always_were(where):
 def test_every_run_that_is_in_the_archive_is_one_of_todays_studies():
     scales = [("classic_control", "small"), ("classic_control", "medium"), ("noise", "small")]
     scales += [(name, scale) for name in ("ppo", "sac", "snr") for scale in ("small", "medium")]
-    scales += [("actor_critic", "small")]
-    scales += [(name, "medium") for name in ("distribution", "weight_decay", "noise")]
+    scales += [(name, "small") for name in ("actor_critic", "robust_value", "scaling")]
+    scales += [
+        (name, scale) for name in ("distribution", "weight_decay") for scale in ("small", "medium")
+    ]
+    scales += [("noise", "medium")]
     known = {cell.address for where in scales for cell in Study.read(*where).cells}
     lines = [json.loads(line) for line in RUNS.read_text().splitlines()]
     assert len(lines) >= 211

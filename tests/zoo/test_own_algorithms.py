@@ -180,5 +180,5 @@ def test_an_error_inside_sb3_contrib_does_not_read_as_if_it_were_not_installed(t
 def test_an_algorithm_without_a_class_of_ours_says_which_one_to_take():
     import sb3_sparse
 
-    with pytest.raises(AttributeError, match="sb3_contrib.CrossQ takes SparsePolicy"):
-        sb3_sparse.CrossQ  # noqa: B018
+    with pytest.raises(AttributeError, match="sb3_contrib.TRPO takes SparsePolicy"):
+        sb3_sparse.TRPO  # noqa: B018
