@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable
 from functools import partial
 from typing import Any
 
+import torch as th
+
 from sb3_sparse.algorithms.soft import LOGGED, StochasticActor
-from sb3_sparse.fused.batch_renorm import settings_of_renorm
 from sb3_sparse.fused.distributions import least_of
 from sb3_sparse.fused.machine import Machine
 from sb3_sparse.fused.parts import parts
@@ -37,9 +37,11 @@ class CrossQ(StochasticActor, contrib.CrossQ):
         "critic": ("forward", "extract_features", "set_bn_training_mode"),
     }  # fmt: skip
 
-    def _depends_on(self) -> tuple[Hashable, ...]:
-        norms = [*renorms_of(self.actor), *renorms_of(self.critic)]
-        return tuple(map(settings_of_renorm, norms))
+    @property
+    def _fixed_ent_coef(self) -> th.Tensor:
+        return (
+            self.ent_coef_tensor if self.log_ent_coef is None else self.log_ent_coef.detach().exp()
+        )
 
     def _record(self, program: Program, source: str) -> None:
         actor, critic = self.actor, self.critic
@@ -68,36 +70,34 @@ class CrossQ(StochasticActor, contrib.CrossQ):
     def _train_fused(self, gradient_steps: int, batch_size: int = 64) -> None:
         source = self._start_round()
         logged: dict[str, list[float]] = {name: [] for name in LOGGED}
-        for _ in range(gradient_steps):
+        for step in range(gradient_steps):
             machine, data = self._next_batch(batch_size, source)
             self._n_updates += 1
             delayed = self._n_updates % self.policy_delay == 0
             raise_error = partial(self._raise_error, machine, data)
             self._set_inputs(machine, "next_noise")
             machine.run(0, machine.marks["delayed"], raise_error)
-            self._count(self.critic)
+            if step == 0:
+                self.critic.set_bn_training_mode(False)  # as SB3's first step does here
             if delayed:
                 self._set_inputs(machine, "noise")
                 machine.run(machine.marks["delayed"], None, raise_error)
-                self._count(self.actor)
             for name in machine.program.logged:
                 if delayed or name in ("ent_coef", "critic_loss"):
                     logged[name].append(machine.number(name))
-        for module in (self.actor, self.critic):
-            module.set_bn_training_mode(False)  # as SB3's steps leave them
+        self.actor.set_bn_training_mode(False)
         self._log_round(logged)
 
-    @staticmethod
-    def _count(module: Any) -> None:
-        """Count the batch that the norms of a module have seen."""
-        for norm in renorms_of(module):
-            norm.steps.add_(1)
-
     def _raise_error(self, machine: Machine, data: Any, noise: str) -> None:
+        """As in the base, where the actor's BatchRenorms are in training mode for its own loss.
+
+        An error leaves them as SB3's does, with running statistics that have moved. Without one,
+        the program moves them.
+        """
         trains = noise == "noise"
         self.actor.set_bn_training_mode(trains)
         buffers = [buffer for norm in renorms_of(self.actor) for buffer in norm.buffers()]
         before = [buffer.clone() for buffer in buffers]
-        super()._raise_error(machine, data, noise)  # an error leaves the statistics as in SB3
+        super()._raise_error(machine, data, noise)
         for buffer, kept in zip(buffers, before, strict=True):
             buffer.copy_(kept)

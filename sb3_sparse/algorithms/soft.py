@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Hashable
 from functools import partial
 from typing import Any
 
@@ -42,6 +43,18 @@ class StochasticActor(OffPolicy):
         optimizers = [self.actor.optimizer, self.critic.optimizer]
         return optimizers + ([self.ent_coef_optimizer] if self.ent_coef_optimizer else [])
 
+    @property
+    def _learns_ent_coef(self) -> bool:
+        return self.log_ent_coef is not None and self.ent_coef_optimizer is not None
+
+    @property
+    def _fixed_ent_coef(self) -> th.Tensor:
+        """The entropy coefficient where it is not learned."""
+        return self.ent_coef_tensor
+
+    def _depends_on(self) -> tuple[Hashable, ...]:
+        return (self._learns_ent_coef,)
+
     def _others(self) -> list[th.Tensor]:
         return [] if self.log_ent_coef is None else [self.log_ent_coef]
 
@@ -70,17 +83,19 @@ class StochasticActor(OffPolicy):
 
     def _record_ent_coef(self, program: Program) -> Value:
         """Record the present entropy coefficient."""
-        if self.log_ent_coef is None:
-            ent_coef = program.scalar("ent_coef")
-        else:
+        if self._learns_ent_coef:
+            assert self.log_ent_coef is not None
             ent_coef = program.parameter(self.log_ent_coef).exp().detach()
+        else:
+            ent_coef = program.scalar("ent_coef")
         program.log("ent_coef", ent_coef)
         return ent_coef
 
     def _adjust_ent_coef(self, program: Program, log_prob: Value) -> None:
         """Record the step of the entropy coefficient, if it is learned."""
-        if self.log_ent_coef is None:
+        if not self._learns_ent_coef:
             return
+        assert self.log_ent_coef is not None
         apart = (log_prob + program.scalar("target_entropy")).detach()
         loss = -(program.parameter(self.log_ent_coef) * apart).mean()
         program.log("ent_coef_loss", loss)
@@ -94,8 +109,8 @@ class StochasticActor(OffPolicy):
         shape = (machine.batch, *(self.action_space.shape or ()))
         machine.inputs.load({noise: th.randn(shape) for noise in noises})
         machine.set({"target_entropy": float(self.target_entropy)})
-        if self.log_ent_coef is None:
-            machine.set({"ent_coef": float(self.ent_coef_tensor)})
+        if not self._learns_ent_coef:
+            machine.set({"ent_coef": float(self._fixed_ent_coef)})
 
     def _raise_error(self, machine: Machine, data: Any, noise: str) -> None:
         """Let SB3's distribution raise its error, e.g. for means that are not finite."""

@@ -26,7 +26,7 @@ class TQC(SoftActorCritic, StockTQC):
     """
 
     def _depends_on(self) -> tuple[Hashable, ...]:
-        return (self.top_quantiles_to_drop_per_net,)
+        return *super()._depends_on(), self.top_quantiles_to_drop_per_net
 
     def _next_values(self, program: Program, x: Value) -> Value:
         critic = self.critic

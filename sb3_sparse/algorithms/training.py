@@ -16,10 +16,11 @@ from stable_baselines3.common.preprocessing import preprocess_obs
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
-from sb3_sparse.engine.activations import ADJUSTABLE, settings_of
+from sb3_sparse.engine.activations import ADJUSTABLE, number_of
 from sb3_sparse.engine.changes import ChangeDetector, patched
 from sb3_sparse.engine.internals import any_global_hook, module_hooks
 from sb3_sparse.engine.native.library import why_missing
+from sb3_sparse.engine.norms import NORMS, is_warm, training_settings_of
 from sb3_sparse.errors import UnsupportedError
 from sb3_sparse.fused.errors import NotCovered
 from sb3_sparse.fused.machine import Machine
@@ -46,6 +47,9 @@ class Training:
         self._tensors: list[Any] = []
         self._seen: list[Any] = []
         self._adjustable: list[nn.Module] = []
+        self._norms: list[nn.Module] = []
+        self._renorms: list[nn.Module] = []
+        self._warm: list[bool] = []
         self._acting: list[dict[str, Any]] = []
         self._settings: list[Any] = []
         self._policy: Any = None
@@ -88,6 +92,8 @@ class Training:
             self._hooked = list(map(vars, modules))
             self._tensors = [*_trained(policy)]
             self._adjustable = [m for m in modules if isinstance(m, ADJUSTABLE)]
+            self._norms = [m for m in modules if isinstance(m, tuple(NORMS))]
+            self._renorms = [m for m in self._norms if not isinstance(m, nn.LayerNorm)]
             self._acting = [vars(m) for m in modules if "action_dist" in vars(m)]
             self._settings = self._settings_now()
             self._changes = ChangeDetector(modules)
@@ -115,7 +121,9 @@ class Training:
     def _settings_now(self) -> list[Any]:
         """Collect what may change while modules, tensors and attributes stay the same."""
         distributions = [attributes["action_dist"] for attributes in self._acting]
-        return [*map(settings_of, self._adjustable), *distributions, *map(type, distributions)]
+        norms = map(training_settings_of, self._norms)
+        activations = map(number_of, self._adjustable)
+        return [*activations, *norms, *distributions, *map(type, distributions)]
 
     def machine(
         self,
@@ -132,6 +140,10 @@ class Training:
         :param build: records the program
         :raises NotCovered: if programs cannot compute it
         """
+        warm = [is_warm(norm) for norm in self._renorms]
+        if warm != self._warm:
+            self._machines.clear()
+            self._warm = warm
         sparse = self._policy.sparse
         capture = [o for o in optimizers if sparse.needs_torch(o) and sparse.wants_gradients(o)]
         whole = (*key, th.get_num_threads(), *map(id, optimizers), -1, *map(id, capture))

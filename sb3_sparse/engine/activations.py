@@ -26,8 +26,8 @@ ACTIVATIONS: dict[type[nn.Module], Activation] = {
 }
 """Gives the number and the parameters of an activation in ``kernels.h``."""
 
-ADJUSTABLE = (nn.ELU, nn.CELU, nn.GELU, nn.Softplus, nn.LeakyReLU, nn.Hardtanh, nn.LayerNorm)
-"""Modules with numbers as attributes, which the user may change."""
+ADJUSTABLE = (nn.ELU, nn.CELU, nn.GELU, nn.Softplus, nn.LeakyReLU, nn.Hardtanh)
+"""Activations with numbers as attributes, which the user may change."""
 _WITH_SLOPE: dict[type[nn.Module], Callable[[Any], bool]] = {
     nn.ReLU: lambda _: True,
     nn.Tanh: lambda _: True,
@@ -45,11 +45,6 @@ def tells_its_slope(module: nn.Module) -> bool:
     """Whether the slope follows from the result alone, as the kernels' backward pass needs it."""
     tells = _WITH_SLOPE.get(type(module))
     return tells is not None and tells(module)
-
-
-def settings_of(module: nn.Module) -> tuple[Any, ...]:
-    """Return what the kernels take of an :data:`ADJUSTABLE` module besides its tensors."""
-    return (module.eps,) if isinstance(module, nn.LayerNorm) else number_of(module)
 
 
 def number_of(module: nn.Module | None) -> tuple[int, float, float]:

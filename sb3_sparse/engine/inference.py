@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from torch import nn
 from torch.compiler import is_compiling
 
-from sb3_sparse.engine.activations import ADJUSTABLE, number_of, settings_of
+from sb3_sparse.engine.activations import ADJUSTABLE, number_of
 from sb3_sparse.engine.buffer import FloatBuffer
 from sb3_sparse.engine.chains import watched
 from sb3_sparse.engine.changes import patched
@@ -193,7 +193,7 @@ class Inference:
         return binding
 
     def _settings(self) -> list[tuple[Any, ...]]:
-        return [*map(settings_of, self._adjustable), *map(settings_of_norm, self._norms)]
+        return [*map(number_of, self._adjustable), *map(settings_of_norm, self._norms)]
 
     def _bind(self) -> Binding | None:
         """Hold the present tensors for as long as the kernels may read them.

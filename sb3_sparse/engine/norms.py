@@ -30,6 +30,18 @@ def settings_of_norm(norm: Any) -> tuple[Any, ...]:
     return (norm.eps,) if isinstance(norm, nn.LayerNorm) else (norm.eps, is_ready(norm))
 
 
+def training_settings_of(norm: Any) -> tuple[Any, ...]:
+    """Return what a recorded gradient step takes of a norm besides its tensors."""
+    if isinstance(norm, nn.LayerNorm):
+        return (norm.eps,)
+    return norm.eps, norm.momentum, norm.affine, norm.rmax, norm.dmax
+
+
+def is_warm(norm: Any) -> bool:
+    """Whether a BatchRenorm is behind its warm-up, and normalises by its running statistics too."""
+    return bool(norm.steps.item() > norm.warmup_steps)
+
+
 def is_ready(norm: Any) -> bool:
     """Whether the kernels can apply a norm when a network acts: not while it learns statistics."""
     return isinstance(norm, nn.LayerNorm) or (norm.affine and not norm.training)

@@ -6,8 +6,8 @@ from functools import partial
 from typing import Any
 
 import torch as th
-from torch import nn
 
+from sb3_sparse.engine.norms import is_warm
 from sb3_sparse.fused.errors import NotCovered
 from sb3_sparse.fused.values import Back, Value
 
@@ -15,29 +15,19 @@ Statistics = list[tuple[th.Tensor, Value]]
 """Running statistics of a norm, each with its next value."""
 
 
-def is_warm(norm: Any) -> bool:
-    """Whether a BatchRenorm is behind its warm-up, and normalises by its running statistics too."""
-    return bool(norm.steps > norm.warmup_steps)
-
-
-def settings_of_renorm(norm: Any) -> tuple[Any, ...]:
-    """Return what a recorded BatchRenorm depends on besides its tensors."""
-    bounds = norm.rmax, norm.dmax
-    return is_warm(norm), norm.eps, norm.momentum, norm.affine, *bounds
-
-
-def by_running_statistics(norm: nn.Module, x: Value) -> Value:
+def by_running_statistics(norm: Any, x: Value) -> Value:
     """Normalise as BatchRenorm does outside of training.
 
     :param norm: sb3-contrib's ``BatchRenorm1d``
     :param x: ``[batch, features]``
+    :return: ``[batch, features]``
+    :raises NotCovered: if the norm has another number of features, or no scale and bias
     """
-    settings: Any = norm
-    scale, bias, mean, variance = _tensors(settings, x)
-    return _scaled(_centred(x, mean), scale / (variance + settings.eps).sqrt(), bias)
+    scale, bias, mean, variance = _tensors(norm, x)
+    return _scaled(_centred(x, mean), scale / (variance + norm.eps).sqrt(), bias)
 
 
-def renormalised(norm: nn.Module, batches: list[Value]) -> tuple[list[Value], Statistics]:
+def renormalised(norm: Any, batches: list[Value]) -> tuple[list[Value], Statistics]:
     """Normalise as BatchRenorm does in training, on the entries of one batch or two.
 
     Features that are the same in all entries get no gradient after the warm-up, where that of
@@ -46,37 +36,37 @@ def renormalised(norm: nn.Module, batches: list[Value]) -> tuple[list[Value], St
     :param norm: sb3-contrib's ``BatchRenorm1d``
     :param batches: each ``[batch, features]``
     :return: each batch normalised, and the norm's next running statistics
+    :raises NotCovered: as :func:`by_running_statistics`
 
     Source: arXiv:1702.03275.
     """
     program: Any = batches[0].program
-    settings: Any = norm
-    scale, bias, running_mean, running_variance = _tensors(settings, batches[0])
+    scale, bias, running_mean, running_variance = _tensors(norm, batches[0])
     warm = is_warm(norm)
     constant: list[Value] = []
     if warm:
-        batches = [_unless(constant, x) for x in batches]
+        batches = [_without_gradient_of(constant, x) for x in batches]
     mean = _mean(batches)
     centred = [_centred(x, mean) for x in batches]
-    others = program.scalar("batch - 1")
+    degrees_of_freedom = program.scalar("batch - 1")
     if len(batches) > 1:
-        others = (others + 1.0) * float(len(batches)) - 1.0
-    variance = _squares(centred) / others
-    deviation = (variance + settings.eps).sqrt()
+        degrees_of_freedom = (degrees_of_freedom + 1.0) * float(len(batches)) - 1.0
+    variance = _squares(centred) / degrees_of_freedom
+    deviation = (variance + norm.eps).sqrt()
     if warm:
         constant.append(variance.same(0.0))
-        running = (running_variance + settings.eps).sqrt()
-        ratio = (deviation / running).detach().clamp(1 / settings.rmax, settings.rmax)
-        shift = ((mean - running_mean) / running).detach().clamp(-settings.dmax, settings.dmax)
-        factor = scale / (variance / ratio.square() + settings.eps).sqrt()
+        running = (running_variance + norm.eps).sqrt()
+        ratio = (deviation / running).detach().clamp(1 / norm.rmax, norm.rmax)
+        shift = ((mean - running_mean) / running).detach().clamp(-norm.dmax, norm.dmax)
+        factor = scale / (variance / ratio.square() + norm.eps).sqrt()
         bias = shift * _root(variance) / ratio * factor + bias
     else:
         factor = scale / deviation
-    moved = [
-        (settings.ra_mean, running_mean + (mean - running_mean) * settings.momentum),
-        (settings.ra_var, running_variance + (variance - running_variance) * settings.momentum),
+    next_statistics = [
+        (norm.ra_mean, running_mean + (mean - running_mean) * norm.momentum),
+        (norm.ra_var, running_variance + (variance - running_variance) * norm.momentum),
     ]
-    return [_scaled(x, factor, bias) for x in centred], moved
+    return [_scaled(x, factor, bias) for x in centred], next_statistics
 
 
 def _tensors(norm: Any, x: Value) -> tuple[Value, Value, Value, Value]:
@@ -140,19 +130,25 @@ def _dot(x: Value, y: Value) -> Value:
     return made
 
 
-def _total(g: Value) -> Value:
+def _sum_over_batch(g: Value) -> Value:
     return _dot(g, g.program.constant(1.0))
 
 
 def _centred(x: Value, mean: Value) -> Value:
-    made = Value(x.program, x.features, True, ((x, lambda g: g), (mean, lambda g: -_total(g))))
+    made = Value(
+        x.program, x.features, True, ((x, lambda g: g), (mean, lambda g: -_sum_over_batch(g)))
+    )
     x.program.record("SUBTRACT", made, x, mean)
     return made
 
 
 def _scaled(x: Value, factor: Value, shift: Value) -> Value:
     made = Value(x.program, x.features, True)
-    made.parents = ((x, lambda g: g * factor), (factor, lambda g: _dot(g, x)), (shift, _total))
+    made.parents = (
+        (x, lambda g: g * factor),
+        (factor, lambda g: _dot(g, x)),
+        (shift, _sum_over_batch),
+    )
     x.program.record("MULTIPLY_ADD", made, x, factor, shift)
     return made
 
@@ -164,7 +160,7 @@ def _root(x: Value) -> Value:
     return made
 
 
-def _unless(constant: list[Value], x: Value) -> Value:
+def _without_gradient_of(constant: list[Value], x: Value) -> Value:
     """Pass on the gradient of the features that are not constant, which is known later."""
     made = x.detach()
     made.parents = ((x, lambda g: g * (1.0 - constant[0])),)

@@ -83,7 +83,7 @@ class Descent:
         if not again:
             slots = program.slots
             if any(s.tensor is module.weight and s.optimizer is self._optimizer for s in slots):
-                raise NotCovered("an optimizer that moves a layer twice")
+                raise NotCovered("weights that two layers share, or that an optimizer moves twice")
             program.slot(module.weight, layer, self._optimizer)
             if module.bias is not None:
                 program.slot(module.bias, None, self._optimizer)
@@ -103,7 +103,7 @@ class Descent:
         """Add to a parent's gradient, summed over the dimensions to which it was broadcast."""
         if g.features > parent.features:
             g = g.sum_features()
-        elif g.features < parent.features and parent not in self._program.parts:
+        elif g.features < parent.features and g.origin is None:
             spread = Value(self._program, parent.features, g.batched)
             self._program.record("COPY", spread, g)
             g = spread
@@ -111,6 +111,8 @@ class Descent:
             g = g.sum()
         one = self._grads.get(parent)
         if one is not None:
+            if one.origin != g.origin:
+                one, g = (parent.whole(x) for x in (one, g))
             total = one + g
             total.gated, total.origin = g.gated and one.gated, g.origin
             g = total

@@ -27,14 +27,20 @@ class Machine:
     :param program: the program
     :param controller: controller of the policy whose tensors the program moves
     :param batch: maximum batch size
+    :raises ValueError: if running statistics of the program would never move
     """
 
     def __init__(self, program: Program, controller: Controller, batch: int) -> None:
         self.program = program
         self.controller = controller
         self.capacity = batch
+        if program.statistics:
+            raise ValueError(
+                "a training_network has no minimise after it, which moves its statistics"
+            )
         self.operations = in_phases(program.operations)
         self.steps = [self._index_of(m.step) for m in program.minimised]
+        self._counters = [(self._index_of(stored), steps) for stored, steps in program.counters]
         self.marks = {name: self._index_of(step) + 1 for name, step in program.marks.items()}
         self.tables = Tables(program, controller)
         self.threads = th.get_num_threads()
@@ -175,7 +181,10 @@ class Machine:
             first = at + 1
 
     def _count(self, first: int, last: int) -> None:
-        """Count the optimizer steps within a range of operations."""
+        """Count the optimizer steps, and the batches of norms, within a range of operations."""
+        for stored, steps in self._counters:
+            if first <= stored < last:
+                steps.add_(1)
         for minimised, step in zip(self.program.minimised, self.steps, strict=True):
             if first <= step < last:
                 self.controller.count_step(minimised.optimizer)

@@ -7,16 +7,18 @@ from typing import Any
 
 from sb3_sparse.fused.values import Value
 
-NAMES = """
+SHARED = """
 COPY ADD SUBTRACT MULTIPLY MULTIPLY_ADD DIVIDE LEAST LESS SAME CLAMP INSIDE EXP LOG SQRT ABS HUBER
 SLOPE_INPUT FILL
+"""
+OTHERS = """
 ACTIVATION SLOPE_RESULT SUM_FEATURES MAX_FEATURES PICK PUT ARGMAX SORT QUANTILE_HUBER LOAD_ROWS
 LINEAR LINEAR_BACK LINEAR_GRAD LINEAR_DENSE_GRAD SUM_BATCH MEAN_BATCH DOT_BATCH CHECK
 SPREAD EXPORT STORE PACK TURN MASK_GRADS CLIP_NORM OPTIMIZE POLYAK
 """
-KINDS = {name: number for number, name in enumerate(NAMES.split())}
+KINDS = {name: number for number, name in enumerate((SHARED + OTHERS).split())}
 """The number of each kind."""
-READ_SHARED = set(list(KINDS)[: KINDS["FILL"] + 1])
+READ_SHARED = set(SHARED.split())
 """Kinds that read what the whole batch shares, when they run on tiles."""
 
 

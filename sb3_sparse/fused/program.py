@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 import torch as th
 from torch import nn
 
 from sb3_sparse.engine.activations import number_of, tells_its_slope
 from sb3_sparse.engine.paths import Part
-from sb3_sparse.fused.batch_renorm import by_running_statistics, renormalised
+from sb3_sparse.fused.batch_renorm import Statistics, by_running_statistics, renormalised
 from sb3_sparse.fused.descent import Descent
 from sb3_sparse.fused.errors import NotCovered
 from sb3_sparse.fused.operations import Operation
@@ -41,7 +42,10 @@ class Program(Recording):
         self.logged: dict[str, Value] = {}
         self.checks: dict[int, str] = {}
         self.marks: dict[str, Operation] = {}
-        self.statistics: list[tuple[th.Tensor, Value]] = []
+        self.statistics: dict[Any, Statistics] = {}
+        """Next running statistics of norms, until :meth:`minimise` stores them."""
+        self.counters: list[tuple[Operation, th.Tensor]] = []
+        """Counters of the batches that norms have seen, each with the operation that it counts."""
         self._places: dict[int, int] = {}
 
     # Inputs
@@ -73,7 +77,8 @@ class Program(Recording):
             self.record("COPY", made.view(at, at + value.features), value)
 
             def back(g: Value, first: int = at, count: int = value.features) -> Value:
-                return g.view(first - g.origin, first - g.origin + count)
+                first -= g.origin or 0
+                return g.view(first, first + count)
 
             parents.append((value, back))
             at += value.features
@@ -84,8 +89,20 @@ class Program(Recording):
     def network(self, parts: Parts, x: Value) -> Value:
         """Apply linear layers, their norms, activations and shortcuts in turn.
 
-        A BatchRenorm uses its running statistics.
+        A BatchRenorm normalises by its running statistics.
 
+        Example::
+
+            from torch import nn
+            from sb3_sparse.fused import Program, parts
+
+            program = Program()
+            layers = parts(nn.Linear(3, 8), nn.ReLU(), nn.Linear(8, 2))
+            program.network(layers, program.input("obs", 3)).features  # 2
+
+        :param parts: the network, from :func:`parts`
+        :param x: ``[batch, features]``, as many features as the network has inputs
+        :return: ``[batch, outputs]``
         :raises NotCovered: for a module that the kernels do not know
         """
         return self._apply(parts, [x], trains=False)[0]
@@ -93,12 +110,30 @@ class Program(Recording):
     def training_network(self, parts: Parts, *batches: Value) -> list[Value]:
         """Apply a network to one batch or two at once, its BatchRenorms in training mode.
 
-        They use the mean and variance of all these entries, and move their running statistics in
-        the next :meth:`minimise`.
+        They normalise by the mean and variance of all these entries. Their running statistics and
+        their counter of batches move in the next :meth:`minimise`, without which no program runs.
 
-        :return: the result of each batch
-        :raises NotCovered: as :meth:`network`
+        Example::
+
+            from sb3_sparse import CrossQ
+            from sb3_sparse.fused import Program, parts
+
+            critic = CrossQ("SparsePolicy", "Pendulum-v1", policy_kwargs=dict(sparsity=0.9)).critic
+            program = Program()
+            now, later = program.input("now", 4), program.input("later", 4)
+            layers = parts(critic.q_networks[0])
+            value, next_value = program.training_network(layers, now, later)
+            program.minimise((value - next_value.detach()).square().mean(), critic.optimizer)
+
+        :param parts: the network, from :func:`parts`
+        :param batches: one or two of ``[batch, features]``
+        :return: the result of each batch, ``[batch, outputs]``
+        :raises ValueError: for another number of batches
+        :raises NotCovered: as :meth:`network`; for a BatchRenorm that is in training mode twice
+            before a :meth:`minimise`
         """
+        if not 1 <= len(batches) <= 2:
+            raise ValueError(f"training_network takes one batch or two, not {len(batches)}")
         return self._apply(parts, list(batches), trains=True)
 
     def _apply(self, parts: Parts, batches: list[Value], trains: bool) -> list[Value]:
@@ -106,9 +141,10 @@ class Program(Recording):
         for layer, activation, norm, shortcut in parts:
             if isinstance(norm, nn.LayerNorm):
                 batches = [self._layer_norm(norm, x) for x in batches]
+            elif norm in self.statistics:
+                raise NotCovered("a BatchRenorm that is used again before its statistics move")
             elif norm is not None and trains:
-                batches, moved = renormalised(norm, batches)
-                self.statistics += moved
+                batches, self.statistics[norm] = renormalised(norm, batches)
             elif norm is not None:
                 batches = [by_running_statistics(norm, x) for x in batches]
             if layer is not None:
@@ -167,7 +203,8 @@ class Program(Recording):
             self.record("TURN", None, number=layer, tiled=False, writes=(("turned", layer),))
         first, last = self._wanted(x)
         made = Value(self, last - first, True)
-        made.origin = first
+        if made.features < x.features:
+            made.origin = first
         operands = [g]
         if x in self.behind and self.behind[x].activation[0] == RELU:
             operands.append(x)
@@ -221,12 +258,14 @@ class Program(Recording):
 
     def _store_statistics(self) -> None:
         """Move the running statistics of norms that have seen batches."""
-        for tensor, value in self.statistics:
-            self.record(
-                "STORE", None, value, features=value.features, number=self.slot(tensor, None),
-                tiled=False, changes=True,
-            )  # fmt: skip
-            self.vectors.pop(id(tensor), None)  # a later norm must read it again
+        for norm, statistics in self.statistics.items():
+            for tensor, value in statistics:
+                stored = self.record(
+                    "STORE", None, value, features=value.features, number=self.slot(tensor, None),
+                    tiled=False, changes=True,
+                )  # fmt: skip
+                self.vectors.pop(id(tensor), None)  # a later norm must read it again
+            self.counters.append((stored, norm.steps))
         self.statistics.clear()
 
     def polyak_update(self, network: Parts, target_network: Parts, tau: Value) -> None:

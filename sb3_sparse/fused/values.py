@@ -66,8 +66,8 @@ class Value:
         self.parents = parents
         self.root = self
         self.offset = 0
-        self.origin = 0
-        """First feature of a gradient that covers only some features."""
+        self.origin: int | None = None
+        """First feature that a gradient covers; None: it covers all, or 1 is broadcast to them."""
         self.gated = False
         """Whether a gradient is already 0 where the ReLU before it is."""
         program.values.append(self)
@@ -87,6 +87,10 @@ class Value:
         found = self.view(first, last)
         found.parents = ((self, lambda g: self._embedded(g, first, last)),)
         return found
+
+    def whole(self, g: Value) -> Value:
+        """Complete a gradient that covers only some features of this value by zeros."""
+        return g if g.origin is None else self._embedded(g, g.origin, g.origin + g.features)
 
     def _embedded(self, g: Value, first: int, last: int) -> Value:
         whole = Value(self.program, self.features, self.batched)

@@ -313,6 +313,30 @@ def test_targets_without_any_quantile_are_stock_training():
     assert_alike(ours, stock)
 
 
+def freeze(model):
+    model.ent_coef_optimizer = None
+    if not isinstance(model, STOCK.CrossQ):  # which keeps the learned one
+        model.ent_coef_tensor = th.tensor(0.1)
+
+
+def forget(model):
+    freeze(model)
+    model.log_ent_coef, model.ent_coef_tensor = None, th.tensor(0.2)
+
+
+@pytest.mark.parametrize("change", [freeze, forget])
+@pytest.mark.parametrize("name", ["SAC", "TQC", "CrossQ"])
+def test_an_entropy_coefficient_may_stop_being_learned(name, change):
+    def train(library):
+        model = learn(make(library, name))
+        change(model)
+        return learn(model, steps=5)
+
+    ours = train(sb3_sparse)
+    assert ours.why_not_fused() is None
+    assert_alike(ours, train(STOCK))
+
+
 def test_settings_of_norms_are_followed():
     def train(library):
         model = learn(make(library, "CrossQ"))
@@ -324,6 +348,7 @@ def test_settings_of_norms_are_followed():
 
     ours = train(sb3_sparse)
     assert ours.why_not_fused() is None
+    assert len(ours._trains()._machines) == 1  # none of earlier settings keeps its memory
     assert_alike(ours, train(STOCK))
 
 

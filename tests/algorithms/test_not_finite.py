@@ -85,6 +85,29 @@ def test_a_bias_that_is_not_finite(name, place, number):
     assert_ends_alike(name, spoil)
 
 
+@pytest.mark.parametrize("rounds", [0, 1, 2])
+def test_an_error_leaves_norms_in_the_mode_of_stock(rounds):
+    modes = []
+    for library in (sb3_sparse, STOCK):
+        model = learn(make(library, "CrossQ", policy_kwargs=dict(sparsity=0.0)))
+        sample = model.replay_buffer.sample
+        calls = []
+
+        def draw(*args, sample=sample, calls=calls, model=model, **kwargs):
+            if len(calls) == rounds:
+                with th.no_grad():
+                    last_bias(model.policy.actor.mu)[0] = NAN
+            calls.append(args)
+            return sample(*args, **kwargs)
+
+        model.replay_buffer.sample = draw
+        with pytest.raises(ValueError, match="Expected parameter"):
+            model.train(4, 70)
+        assert library is STOCK or fused(model)
+        modes.append([module.training for module in model.policy.modules()])
+    assert modes[0] == modes[1]
+
+
 @pytest.mark.parametrize("name", PLACES)
 def test_a_nan_passes_through_hidden_layers(name):
     def spoil(policy):

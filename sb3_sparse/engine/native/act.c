@@ -133,7 +133,7 @@ static void by_statistics(const step_t *step, int64_t lanes, const float *x, flo
     }
 }
 
-/* The same by LayerNorm. */
+/* LayerNorm of each of `lanes` inputs, whose features are `lanes` apart. */
 static void normalise(const step_t *step, int64_t lanes, const float *x, float *y) {
     int64_t n = step->columns;
     for (int64_t e = 0; e < lanes; e++) {

@@ -2,7 +2,7 @@
  *
  * Values lie in tiles (see kernels.h). A batched value has [tiles, features, TILE] numbers. One that
  * the whole batch shares has [features, TILE], of which the first vector is in use, with all lanes
- * equal; among tiled operations, only elementwise ones and FILL read it. Operations marked `tiled`
+ * equal; among tiled operations, only the kinds up to FILL read it. Operations marked `tiled`
  * that follow each other are a phase: a tile goes through all of them before the next one begins, and
  * threads share the tiles. All others run once, on one thread, between phases.
  *
@@ -84,7 +84,7 @@ typedef struct {
 
 /* Kinds of operations. Python has the same list. */
 enum {
-    /* elementwise: to = f(a, b, c) */
+    /* elementwise: to = f(a, b, c); up to FILL, those that read what the whole batch shares */
     COPY, ADD, SUBTRACT, MULTIPLY, MULTIPLY_ADD, DIVIDE, LEAST, /* b where it is less than a, else a */
     LESS, SAME, CLAMP, INSIDE,                    /* of a between b and c */
     EXP, LOG, SQRT, ABS, HUBER,                   /* smooth L1 of a */
