@@ -54,6 +54,7 @@ STUDIES = (
     ("ppo", "medium"),
     ("ppo", "small"),
     ("sac", "medium"),
+    ("sac", "small"),
     ("distribution", "medium"),
     ("distribution", "small"),
     ("actor_critic", "small"),
