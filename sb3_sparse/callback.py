@@ -144,7 +144,8 @@ class SparsityCallback(BaseCallback):
     def _warn_if_nothing_was_due(self) -> None:
         for plan, networks in self._networks_by_plan(self._sparse_policy().sparse).items():
             moves = plan.topology.options and self._began < plan.end
-            if not moves or any(network.updates_due for network in networks):
+            resumed = self._began > 0.0 and any(network.mask_updates for network in networks)
+            if not moves or resumed or any(network.updates_due for network in networks):
                 continue
             steps = (f"{n.name}: {n.clock - self._clocks[n.name]} steps" for n in networks)
             warn(

@@ -292,6 +292,13 @@ def test_training_on_after_the_last_update_says_nothing(recwarn):
     assert not recwarn.list
 
 
+def test_a_resumed_training_counts_the_updates_before_it(recwarn):
+    model = make("SAC").learn(40, callback=SparsityCallback("set", update_interval=2, end=1.0))
+    assert model.policy.sparse.networks[0].mask_updates > 0
+    model.learn(10, callback=SparsityCallback("set", end=1.0), reset_num_timesteps=False)
+    assert not recwarn.list
+
+
 def test_help_shows_the_defaults_and_a_method_leaves_alone_what_it_does_not_take():
     shown = str(inspect.signature(SparsityCallback))
     for default in (

@@ -98,10 +98,15 @@ def test_the_commands_take_the_policy_with_the_greater_return(trained, capsys, l
 
 
 def test_large_policies_are_not_compiled(trained, capsys, monkeypatch):
-    monkeypatch.setattr(ending, "SMALL", 1000)
+    monkeypatch.setattr(ending, "SMALL", 700)
     lines = lines_of(trained[0], capsys)
     assert any(line.startswith("Not exported and timed") for line in lines)
     assert not any("predict" in line for line in lines)
+
+
+def test_the_critics_do_not_count_for_what_is_too_large_to_export(trained, capsys, monkeypatch):
+    monkeypatch.setattr(ending, "SMALL", 1000)  # the actor has 746 parameters if dense
+    assert any("by predict" in line for line in lines_of(trained[0], capsys))
 
 
 def test_whatever_fails_at_the_end_fails_no_run(trained, capsys, monkeypatch):

@@ -233,6 +233,8 @@ class Fused(BaseAlgorithm):
         :raises UnsupportedError: for a policy class that is known to be of another algorithm
         """
         policy, known = self.policy_class, registered().values()
+        if not isinstance(policy, type):
+            return  # it raises when it is called: the algorithm has no such policy
         own = [one.stock_policy for one in known if isinstance(self, one.algorithm)]
         others = possible_algorithms(policy)
         if others and not issubclass(policy, tuple(own)):

@@ -9,11 +9,13 @@ from sb3_sparse.errors import SparsityError, command
 from sb3_sparse.pages.numbers import counted, short
 
 if TYPE_CHECKING:
-    from sb3_sparse.policies.report import SparsityReport
+    from collections.abc import Iterable
+
+    from sb3_sparse.policies.report import LayerReport
     from sb3_sparse.zoo.results import Outcome
 
 SHORT = 1e-3  # by how much rounding may miss a sparsity
-SMALL = 1_000_000  # parameters, if dense, of policies that are exported and timed
+SMALL = 1_000_000  # parameters, if dense, of acting networks that are exported and timed
 
 
 def tell(outcome: Outcome) -> None:
@@ -51,10 +53,12 @@ def _tell_costs(outcome: Outcome) -> None:
     policy = unwrapped(outcome.model.policy)
     assert isinstance(policy, BaseSparsePolicy)
     report = policy.sparsity_report()
-    dense = dense_parameters(report)
+    dense = dense_parameters(report.layers)
     say(f"{'':<26}{'trained':>10}{'dense':>12}")
     say(f"{'Parameters, all networks':<26}{report.parameters:>10,}{dense:>12,}")
-    if dense > SMALL:
+    acting = tuple(f"{name}." for name in policy.acting)
+    acts = [layer for layer in report.layers if f"{layer.name}.".startswith(acting)]
+    if dense_parameters(acts) > SMALL:
         say(f"Not exported and timed, as policies above {SMALL:,} parameters take too long here.")
         return
     try:
@@ -69,9 +73,9 @@ def _tell_costs(outcome: Outcome) -> None:
     say(f"{'An action, microseconds':<26}{times}, one thread")
 
 
-def dense_parameters(report: SparsityReport) -> int:
-    """Return the parameters, biases included, that the networks would have if dense."""
-    return sum(layer.size - layer.nnz + layer.parameters for layer in report.layers)
+def dense_parameters(layers: Iterable[LayerReport]) -> int:
+    """Return the parameters, biases included, that layers would have if dense."""
+    return sum(layer.size - layer.nnz + layer.parameters for layer in layers)
 
 
 def _tell_curve(outcome: Outcome) -> None:

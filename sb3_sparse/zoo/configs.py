@@ -56,10 +56,11 @@ def config_path(method: str, algo: str) -> Path:
     path = config_root() / method / f"{algo}.yml"
     if not path.is_file():
         names = sorted(file.stem for file in path.parent.glob("*.yml"))
+        exists = any(config_root().glob(f"*/{algo}.yml"))
+        guess = "" if exists else did_you_mean(algo, names)
         raise ConfigError(
             f"no config is shipped for {algo!r} with method {method!r}, only for {', '.join(names)}"
-            f"{did_you_mean(algo, names)}. Or write one and pass it as --conf-file "
-            "(docs/configs.md)"
+            f"{guess}. Or write one and pass it as --conf-file (docs/configs.md)"
         )
     return path
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecVideoRecorder
@@ -140,6 +141,10 @@ def _filmed(saved: SavedModel, video: bool) -> Iterator[None]:
     try:
         with redirect_stderr(io.StringIO()) if video else nullcontext():
             yield
+    except gym.error.DependencyNotInstalled as error:
+        if not video or "pygame" not in str(error):
+            raise
+        raise MissingExtra("recording a video", "video") from error
     except OSError:
         raise  # the error already names the folder that cannot be written to
     except Exception as error:

@@ -53,6 +53,8 @@ def test_the_algorithms_that_have_one():
     assert set(NAMES) == set(ALGORITHMS) - {"CrossQ"}
     with pytest.raises(UnsupportedError, match="CrossQ has no SparseSimbaPolicy; it is there for"):
         make("CrossQ", policy="SparseSimbaPolicy")
+    with pytest.raises(UnsupportedError, match="CrossQ has no SparseSimbaPolicy; it is there for"):
+        sb3_sparse.CrossQ("SparseSimbaPolicy", "Pendulum-v1")
 
 
 @pytest.mark.parametrize("compute", STORAGES)
