@@ -327,7 +327,7 @@ def _seconds(runs: Sequence[RunData]) -> str:
 def _said(one: Verdict) -> str:
     text = f"**{one.verdict}**, {one.shown} of the {one.finding.unit}"
     each = f"each of {one.comparisons} comparisons" if one.comparisons > 1 else "one comparison"
-    text += f", {one.seeds} seeds in {each}; it holds for {one.holds}."
+    text += f", {one.seeds} seeds in {each}; the finding holds for effects {one.holds}."
     if one.verdict == UNDECIDED:
         few = one.needed is not None and one.needed <= MANY
         seeds = f"About {one.needed} seeds" if few else f"More than {MANY} seeds"

@@ -143,15 +143,16 @@ class SparsityCallback(BaseCallback):
 
     def _warn_if_nothing_was_due(self) -> None:
         for plan, networks in self._networks_by_plan(self._sparse_policy().sparse).items():
-            moves = plan.topology.options and self._began < plan.end
-            resumed = self._began > 0.0 and any(network.mask_updates for network in networks)
-            if not moves or resumed or any(network.updates_due for network in networks):
+            resumed = self._began > 0.0
+            static = [n for n in networks if not n.updates_due and not (resumed and n.mask_updates)]
+            if not plan.topology.options or self._began >= plan.end or not static:
                 continue
-            steps = (f"{n.name}: {n.clock - self._clocks[n.name]} steps" for n in networks)
+            steps = (f"{n.name}: {n.clock - self._clocks[n.name]} steps" for n in static)
+            whose = "" if static == networks else f" of {', '.join(n.name for n in static)}"
             warn(
-                f"{plan.method!r} had no mask update, so this was static training. An update "
-                f"is due at every {plan.update_interval}th gradient step of a network between "
-                f"{plan.begin:.0%} and {plan.end:.0%} of training, and none fell there ("
+                f"{plan.method!r} had no mask update{whose}, so this was static training. An "
+                f"update is due at every {plan.update_interval}th gradient step of a network "
+                f"between {plan.begin:.0%} and {plan.end:.0%} of training, and none fell there ("
                 f"{', '.join(steps)}); train longer, choose a smaller update_interval or, where "
                 "gradient steps begin late, a smaller learning_starts"
             )

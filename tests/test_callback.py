@@ -292,6 +292,13 @@ def test_training_on_after_the_last_update_says_nothing(recwarn):
     assert not recwarn.list
 
 
+def test_a_network_without_an_update_is_named():
+    model = make("TD3")
+    with pytest.warns(UserWarning, match=r"no mask update of actor, so .*\(actor: 10 steps\)"):
+        model.learn(40, callback=SparsityCallback("set", update_interval=12, end=1.0))
+    assert model.policy.sparse.networks[1].mask_updates > 0
+
+
 def test_a_resumed_training_counts_the_updates_before_it(recwarn):
     model = make("SAC").learn(40, callback=SparsityCallback("set", update_interval=2, end=1.0))
     assert model.policy.sparse.networks[0].mask_updates > 0

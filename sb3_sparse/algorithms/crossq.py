@@ -76,15 +76,15 @@ class CrossQ(StochasticActor, contrib.CrossQ):
             delayed = self._n_updates % self.policy_delay == 0
             raise_error = partial(self._raise_error, machine, data)
             self._set_inputs(machine, "next_noise")
-            machine.run(0, machine.marks["delayed"], raise_error)
+            machine.run(0, machine.mark("delayed"), raise_error)
             if step == 0:
                 self.critic.set_bn_training_mode(False)  # as SB3's first step does here
             if delayed:
                 self._set_inputs(machine, "noise")
-                machine.run(machine.marks["delayed"], None, raise_error)
+                machine.run(machine.mark("delayed"), None, raise_error)
             for name in machine.program.logged:
                 if delayed or name in ("ent_coef", "critic_loss"):
-                    logged[name].append(machine.number(name))
+                    logged.setdefault(name, []).append(machine.number(name))
         self.actor.set_bn_training_mode(False)
         self._log_round(logged)
 

@@ -53,7 +53,7 @@ class StochasticActor(OffPolicy):
         return self.ent_coef_tensor
 
     def _depends_on(self) -> tuple[Hashable, ...]:
-        return (self._learns_ent_coef,)
+        return self._learns_ent_coef, id(self.log_ent_coef)
 
     def _others(self) -> list[th.Tensor]:
         return [] if self.log_ent_coef is None else [self.log_ent_coef]
@@ -188,10 +188,10 @@ class SoftActorCritic(StochasticActor):
             self._set_inputs(machine, "noise", "next_noise")
             machine.set({"tau": self.tau})
             last = (
-                None if step % self.target_update_interval == 0 else machine.marks["target update"]
+                None if step % self.target_update_interval == 0 else machine.mark("target update")
             )
             machine.run(0, last, partial(self._raise_error, machine, data))
             for name in machine.program.logged:
-                logged[name].append(machine.number(name))
+                logged.setdefault(name, []).append(machine.number(name))
         self._n_updates += gradient_steps
         self._log_round(logged)

@@ -79,7 +79,7 @@ class TD3(OffPolicy, stable_baselines3.TD3):
             noise = noise.clamp_(-self.target_noise_clip, self.target_noise_clip)
             machine.inputs.load({"noise": noise})
             machine.set({"tau": self.tau})
-            machine.run(0, None if delayed else machine.marks["delayed"])
+            machine.run(0, None if delayed else machine.mark("delayed"))
             critic_losses.append(machine.number("critic_loss"))
             if delayed:
                 actor_losses.append(machine.number("actor_loss"))

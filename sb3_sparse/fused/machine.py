@@ -41,7 +41,7 @@ class Machine:
         self.operations = in_phases(program.operations)
         self.steps = [self._index_of(m.step) for m in program.minimised]
         self._counters = [(self._index_of(stored), steps) for stored, steps in program.counters]
-        self.marks = {name: self._index_of(step) + 1 for name, step in program.marks.items()}
+        self._marks = {name: self._index_of(step) + 1 for name, step in program.marks.items()}
         self.tables = Tables(program, controller)
         self.threads = th.get_num_threads()
         memory = Memory(self.operations, program.values, batch, self.threads)
@@ -140,6 +140,18 @@ class Machine:
             self.batch = batch
             self._argument[5] = batch
             self.set({"1 / batch": 1 / batch, "batch - 1": batch - 1})
+
+    def mark(self, name: str) -> int:
+        """Return the position of a mark of the program, for :meth:`run`.
+
+        :raises ValueError: if the program has no such mark
+        """
+        if name not in self._marks:
+            raise ValueError(
+                f"the recorded gradient step has no mark {name!r}, which this algorithm needs: "
+                f"call program.mark({name!r}) in _record, behind the minimise that it follows"
+            )
+        return self._marks[name]
 
     def number(self, name: str) -> float:
         """Return the number that the last run logged under ``name``."""

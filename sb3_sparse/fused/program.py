@@ -127,7 +127,7 @@ class Program(Recording):
 
         :param parts: the network, from :func:`parts`
         :param batches: one or two of ``[batch, features]``
-        :return: the result of each batch, ``[batch, outputs]``
+        :return: a list of the result of each batch, ``[batch, outputs]``
         :raises ValueError: for another number of batches
         :raises NotCovered: as :meth:`network`; for a BatchRenorm that is in training mode twice
             before a :meth:`minimise`

@@ -324,9 +324,13 @@ def forget(model):
     model.log_ent_coef, model.ent_coef_tensor = None, th.tensor(0.2)
 
 
-@pytest.mark.parametrize("change", [freeze, forget])
+def replace(model):
+    model.log_ent_coef = th.log(th.tensor([0.5])).requires_grad_()
+
+
+@pytest.mark.parametrize("change", [freeze, forget, replace])
 @pytest.mark.parametrize("name", ["SAC", "TQC", "CrossQ"])
-def test_an_entropy_coefficient_may_stop_being_learned(name, change):
+def test_a_changed_entropy_coefficient_is_followed(name, change):
     def train(library):
         model = learn(make(library, name))
         change(model)

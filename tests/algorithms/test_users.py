@@ -20,6 +20,7 @@ from stable_baselines3.common.buffers import ReplayBuffer, RolloutBuffer
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 import sb3_sparse
+from sb3_sparse.fused import Program
 
 LIBRARIES = (sb3_sparse, STOCK)
 
@@ -57,6 +58,32 @@ def test_a_subclass_that_trains_and_steps_on_top(name):
     assert fused(ours)
     assert ours.trained == stock.trained > 0
     assert ours.stepped == stock.stepped
+
+
+@pytest.mark.parametrize(
+    ("name", "mark", "kwargs"),
+    [
+        ("SAC", "target update", dict(gradient_steps=2, target_update_interval=2)),
+        ("TD3", "delayed", {}),
+        ("CrossQ", "delayed", {}),
+    ],
+)
+def test_a_gradient_step_without_the_mark_that_it_needs_is_told(name, mark, kwargs, monkeypatch):
+    monkeypatch.setattr(Program, "mark", lambda self, name: None)
+    model = make(sb3_sparse, name, **kwargs)
+    with pytest.raises(ValueError, match=rf"no mark '{mark}'.*program\.mark\('{mark}'\)"):
+        learn(model)
+
+
+def test_a_subclass_may_log_more():
+    class Own(sb3_sparse.CrossQ):
+        def _record(self, program, source):
+            super()._record(program, source)
+            program.log("one", program.constant(1.0))
+
+    model = learn(make(Own, "CrossQ"))
+    assert fused(model)
+    assert model.logger.name_to_value["train/one"] == 1.0
 
 
 def test_a_subclass_with_a_train_of_its_own_never_asks():
