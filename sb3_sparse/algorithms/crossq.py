@@ -39,9 +39,9 @@ class CrossQ(StochasticActor, contrib.CrossQ):
 
     @property
     def _fixed_ent_coef(self) -> th.Tensor:
-        return (
-            self.ent_coef_tensor if self.log_ent_coef is None else self.log_ent_coef.detach().exp()
-        )
+        if self.log_ent_coef is None:
+            return self.ent_coef_tensor
+        return self.log_ent_coef.detach().exp()
 
     def _record(self, program: Program, source: str) -> None:
         actor, critic = self.actor, self.critic

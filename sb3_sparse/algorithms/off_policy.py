@@ -12,7 +12,8 @@ import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_sparse.algorithms.training import Fused, Methods, features, mean
+from sb3_sparse.algorithms.base import Fused, features, mean
+from sb3_sparse.algorithms.training import Methods
 from sb3_sparse.fused.errors import NotCovered
 from sb3_sparse.fused.inputs import TYPES
 from sb3_sparse.fused.machine import Machine

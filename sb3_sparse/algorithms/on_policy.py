@@ -13,7 +13,8 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
 from stable_baselines3.common.utils import explained_variance
 
-from sb3_sparse.algorithms.training import Fused, Methods, features
+from sb3_sparse.algorithms.base import Fused, features
+from sb3_sparse.algorithms.training import Methods
 from sb3_sparse.fused.distributions import bernoulli, categorical, gaussian, multi_categorical
 from sb3_sparse.fused.errors import NotCovered
 from sb3_sparse.fused.inputs import TYPES

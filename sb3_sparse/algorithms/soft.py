@@ -44,8 +44,9 @@ class StochasticActor(OffPolicy):
         return optimizers + ([self.ent_coef_optimizer] if self.ent_coef_optimizer else [])
 
     @property
-    def _learns_ent_coef(self) -> bool:
-        return self.log_ent_coef is not None and self.ent_coef_optimizer is not None
+    def _learned(self) -> th.Tensor | None:
+        """The logarithm of the entropy coefficient; None where that is not learned."""
+        return None if self.ent_coef_optimizer is None else self.log_ent_coef
 
     @property
     def _fixed_ent_coef(self) -> th.Tensor:
@@ -53,7 +54,7 @@ class StochasticActor(OffPolicy):
         return self.ent_coef_tensor
 
     def _depends_on(self) -> tuple[Hashable, ...]:
-        return self._learns_ent_coef, id(self.log_ent_coef)
+        return (id(self._learned),)
 
     def _others(self) -> list[th.Tensor]:
         return [] if self.log_ent_coef is None else [self.log_ent_coef]
@@ -83,21 +84,21 @@ class StochasticActor(OffPolicy):
 
     def _record_ent_coef(self, program: Program) -> Value:
         """Record the present entropy coefficient."""
-        if self._learns_ent_coef:
-            assert self.log_ent_coef is not None
-            ent_coef = program.parameter(self.log_ent_coef).exp().detach()
-        else:
+        learned = self._learned
+        if learned is None:
             ent_coef = program.scalar("ent_coef")
+        else:
+            ent_coef = program.parameter(learned).exp().detach()
         program.log("ent_coef", ent_coef)
         return ent_coef
 
     def _adjust_ent_coef(self, program: Program, log_prob: Value) -> None:
         """Record the step of the entropy coefficient, if it is learned."""
-        if not self._learns_ent_coef:
+        learned = self._learned
+        if learned is None:
             return
-        assert self.log_ent_coef is not None
         apart = (log_prob + program.scalar("target_entropy")).detach()
-        loss = -(program.parameter(self.log_ent_coef) * apart).mean()
+        loss = -(program.parameter(learned) * apart).mean()
         program.log("ent_coef_loss", loss)
         program.minimise(loss, self.ent_coef_optimizer)
 
@@ -109,7 +110,7 @@ class StochasticActor(OffPolicy):
         shape = (machine.batch, *(self.action_space.shape or ()))
         machine.inputs.load({noise: th.randn(shape) for noise in noises})
         machine.set({"target_entropy": float(self.target_entropy)})
-        if not self._learns_ent_coef:
+        if self._learned is None:
             machine.set({"ent_coef": float(self._fixed_ent_coef)})
 
     def _raise_error(self, machine: Machine, data: Any, noise: str) -> None:

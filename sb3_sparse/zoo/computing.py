@@ -17,7 +17,7 @@ from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.preprocessing import is_image_space
 
-from sb3_sparse.algorithms.training import Fused
+from sb3_sparse.algorithms.base import Fused
 from sb3_sparse.engine.native.library import in_use, why_missing
 from sb3_sparse.errors import CorruptStateError
 from sb3_sparse.policies.base import BaseSparsePolicy
